@@ -11,6 +11,7 @@ pub(crate) mod join;
 pub(crate) mod list;
 mod listen;
 pub(crate) mod man;
+mod output_file;
 pub(crate) mod plot;
 pub(crate) mod report;
 pub(crate) mod reproduce;

@@ -8,7 +8,7 @@ use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathComplete
 use shoal_common::config::explanation::{Key, sections, set_by_program};
 use shoal_env_server::environment;
 use shoal_run::external_environment::GYMNASIUM;
-use shoal_run::plan::preset_names;
+use shoal_run::plan::{is_configuration_file, preset_names};
 use toml::{Table, Value};
 
 /// The variable that a shell sets when it asks for completions. (Other programs may use plain `COMPLETE`.)
@@ -31,7 +31,7 @@ pub(crate) fn presets_and_files(typed: &OsStr) -> Vec<CompletionCandidate> {
         .chain([GYMNASIUM])
         .filter(|name| name.starts_with(typed_text.as_ref()));
     let files = PathCompleter::any()
-        .filter(|path| path.is_dir() || path.extension().is_some_and(|extension| extension == "toml"))
+        .filter(|path| path.is_dir() || is_configuration_file(path))
         .complete(typed);
     names.map(CompletionCandidate::new).chain(files).collect()
 }

@@ -7,15 +7,16 @@ mod launcher;
 mod listing;
 mod log_level;
 mod role;
+mod status_table;
 mod top;
 
-use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use iceoryx2::prelude::{LogLevel, set_log_level};
+use shoal_common::message::say;
 use shoal_common::role::Role;
 use shoal_run::usage::UsageError;
 
@@ -40,7 +41,7 @@ fn main() -> ExitCode {
     result.unwrap_or_else(|error| {
         // After a broken pipe nobody reads the message.
         if !is_broken_pipe(&error) {
-            let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&error));
+            say(format!("error: {}", with_causes(&error)));
         }
         if error.is::<UsageError>() {
             WRONG_USAGE.into()
@@ -57,7 +58,7 @@ fn wrong_usage(error: &clap::Error) -> ExitCode {
         error.exit();
     }
     let text = error.to_string();
-    let _ = writeln!(std::io::stderr(), "{}", text.lines().next().unwrap_or_default());
+    say(text.lines().next().unwrap_or_default());
     WRONG_USAGE.into()
 }
 
@@ -88,14 +89,14 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Learner(args) => role::run(Role::Learner, args),
         Command::Gate(args) => role::run(Role::Gate, args),
         Command::Relay(args) => role::run(Role::Relay, args),
-        Command::Tied(args) => shoal_run::external_environment::exec_tied(args.parent, &args.program),
+        Command::Tied(args) => shoal_run::child_process::exec_tied(args.parent, &args.program),
         Command::InNewSession(args) => command::detach::exec_in_new_session(&args.arguments),
         Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }
 }
 
 /// The error with its causes, except those whose text it already contains.
-fn in_one_line(error: &anyhow::Error) -> String {
+fn with_causes(error: &anyhow::Error) -> String {
     let mut line = error.to_string();
     for cause in error.chain().skip(1).map(ToString::to_string) {
         if !line.contains(&cause) {

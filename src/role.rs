@@ -1,7 +1,6 @@
 //! One role of a run, in its own process. Reads the run directory and passes each role its settings.
 
 use std::ffi::CString;
-use std::io::Write;
 #[cfg(feature = "remote")]
 use std::path::Path;
 use std::process::ExitCode;
@@ -11,6 +10,7 @@ use shoal_actor::{actor, evaluator};
 use shoal_common::channel::environment::EnvironmentPort;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender};
 use shoal_common::config::{Config, Mode};
+use shoal_common::message::say;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
@@ -80,7 +80,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     ended?;
     if let Err(error) = left {
         // A process that leaves later removes the rest.
-        let _ = writeln!(std::io::stderr(), "{error}");
+        say(error);
     }
     Ok(ExitCode::SUCCESS)
 }

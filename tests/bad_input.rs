@@ -169,7 +169,7 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         ),
         (
             &["pendulum", "--set", "sarsa.alpha=0.1"],
-            "sarsa cannot control pendulum: sarsa needs a discrete action space",
+            "sarsa cannot control pendulum: it needs a discrete action space",
         ),
         (
             &["frozen-lake", "--set", "ddpg.tau=1"],

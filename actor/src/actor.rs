@@ -22,7 +22,7 @@ use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::config::{Config, Mode};
 use shoal_common::exit::Exit;
 use shoal_common::report::EpisodeReport;
@@ -511,14 +511,13 @@ fn wait_for_replay(
     heartbeat: &mut HeartbeatSender,
 ) -> Result<CommitReader, Exit<ActorError>> {
     loop {
-        match CommitReader::open(&settings.replay) {
-            Ok(reader) => return Ok(reader),
-            Err(OpenError::NotYet { .. }) if stop.requested() => return Err(Exit::Stopped),
-            Err(OpenError::NotYet { .. }) => {
-                listener.wait(Duration::from_millis(20))?;
-                heartbeat.beat(Activity::WaitingForPeer);
-            }
-            Err(error) => return Err(error.into()),
+        if let Some(reader) = CommitReader::open_if_ready(&settings.replay)? {
+            return Ok(reader);
         }
+        if stop.requested() {
+            return Err(Exit::Stopped);
+        }
+        listener.wait(Duration::from_millis(20))?;
+        heartbeat.beat(Activity::WaitingForPeer);
     }
 }

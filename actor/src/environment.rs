@@ -11,7 +11,7 @@ use shoal_common::stop::Stop;
 use crate::error::ActorError;
 
 /// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
-pub const GIVEN_UP: &str = "its episodes are given up";
+pub const EPISODES_DROPPED: &str = "its episodes are given up";
 
 /// How long an actor waits after an invalid answer before it begins new episodes.
 const AFTER_FAULT: Duration = Duration::from_millis(50);
@@ -47,7 +47,7 @@ pub(crate) fn after_fault(
     listener: &Listener,
     stop: &Stop,
 ) -> Result<(), Exit<ChannelError>> {
-    tracing::warn!("{error}; {GIVEN_UP}");
+    tracing::warn!("{error}; {EPISODES_DROPPED}");
     heartbeat.count_fault();
     let since = Instant::now();
     while since.elapsed() < AFTER_FAULT {

@@ -10,6 +10,7 @@ use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Li
 use shoal_common::config::Config;
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
+use shoal_common::numbers::mean_and_std;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{EvaluatedPeriod, EvaluationReport};
@@ -82,21 +83,6 @@ fn challenge<E>(
         }
     }
     Ok((Some(if better { candidate } else { best }), better))
-}
-
-/// Mean and sample standard deviation of returns; the latter is 0 for fewer than two.
-pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
-    let n = returns.len() as f64;
-    let mean = returns.iter().sum::<f64>() / n;
-    let squares: f64 = returns.iter().map(|r| (r - mean).powi(2)).sum();
-    (
-        mean,
-        if returns.len() < 2 {
-            0.0
-        } else {
-            (squares / (n - 1.0)).sqrt()
-        },
-    )
 }
 
 /// Evaluates policies until `stop`.
@@ -211,7 +197,7 @@ impl<'a> Evaluator<'a> {
         let header = published.header();
         let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
-        let best = self.becomes_best(&published, return_mean)?;
+        let best = self.challenge_best(&published, return_mean)?;
         if best {
             self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
         }
@@ -240,8 +226,9 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
-    /// Compares this policy with the best one and remembers the better one. Returns whether it is this policy.
-    fn becomes_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
+    /// Compares this policy with the best one, with further episodes of both if it seems better, and keeps the better
+    /// one. Returns whether that is this policy.
+    fn challenge_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
             mean,

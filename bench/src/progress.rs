@@ -5,9 +5,8 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use shoal_common::channel::Domain;
 use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
-use shoal_common::run_dir::RunDir;
 
 use super::measurement::TimeBudget;
 use super::processes::Processes;
@@ -42,7 +41,7 @@ impl<'a> RunProgress<'a> {
             processes.check()?;
             budget.check()?;
             if commits.is_none() {
-                commits = open_commits(&temporary.run)?;
+                commits = CommitReader::open_if_ready(&temporary.run.replay_file())?;
             }
             // The handshake has sequence number 0.
             let has_sent = |commits: &CommitReader, actor: u32| commits.committed(actor as usize).sequence > 0;
@@ -91,15 +90,6 @@ impl<'a> RunProgress<'a> {
     /// Whether the run's learner makes gradient steps.
     pub(super) fn expects_updates(&self) -> bool {
         self.temporary.config.replay.updates_per_step > 0.0
-    }
-}
-
-/// Opens the run's commit record; `None` while it does not exist.
-pub(super) fn open_commits(run: &RunDir) -> anyhow::Result<Option<CommitReader>> {
-    match CommitReader::open(&run.replay_file()) {
-        Ok(reader) => Ok(Some(reader)),
-        Err(OpenError::NotYet { .. }) => Ok(None),
-        Err(error) => Err(error.into()),
     }
 }
 

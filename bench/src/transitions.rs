@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier, wait_for};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::role::Role;
@@ -154,15 +154,12 @@ fn wait_for_replay(
     budget: &TimeBudget,
 ) -> anyhow::Result<CommitReader> {
     loop {
-        match CommitReader::open(&run.replay_file()) {
-            Ok(reader) => return Ok(reader),
-            Err(OpenError::NotYet { .. }) => {
-                learner.check()?;
-                budget.check()?;
-                listener.wait(Duration::from_millis(5))?;
-            }
-            Err(error) => return Err(error.into()),
+        if let Some(reader) = CommitReader::open_if_ready(&run.replay_file())? {
+            return Ok(reader);
         }
+        learner.check()?;
+        budget.check()?;
+        listener.wait(Duration::from_millis(5))?;
     }
 }
 

@@ -179,7 +179,7 @@ impl AlgorithmConfig {
     /// # Errors
     /// When it cannot control such environments.
     pub fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        self.settings().behaviour(self.name(), spec, envs)
+        self.settings().behaviour(spec, envs)
     }
 
     /// Checks that it can control environments like `spec`.

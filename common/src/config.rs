@@ -28,6 +28,7 @@ pub use learner::LearnerConfig;
 pub use remote::RemoteConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
+use shoal_base::message::one_line;
 use shoal_base::section;
 pub use shoal_base::section::{Change, OutOfRange};
 use shoal_base::space::EnvironmentSpec;
@@ -130,7 +131,7 @@ impl Config {
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
             origin: origin.to_string(),
-            message: sections::first_unreadable(&table).unwrap_or_else(|| one_line(&error)),
+            message: sections::first_unreadable(&table).unwrap_or_else(|| one_line(error.message())),
         })?;
         config.check()?;
         Ok(config)
@@ -289,10 +290,6 @@ impl Config {
         }
         Ok(())
     }
-}
-
-fn one_line(error: &toml::de::Error) -> String {
-    error.message().replace('\n', " ")
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ pub mod evaluator_state;
 pub mod run_dir;
 
 pub use shoal_base::{
-    durable, exit, file_lock, report, role, section, space, stop, stream, transition, versioned_file,
+    durable, exit, file_lock, message, numbers, report, role, section, space, stop, stream, transition, versioned_file,
 };
 pub use shoal_channel as channel;
 pub use shoal_channel::commit;

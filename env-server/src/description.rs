@@ -12,8 +12,8 @@ use crate::environment::{Environment, Goal, Picture, Signal, SignalSource};
 pub const FILE_VARIABLE: &str = "SHOAL_DESCRIPTION";
 
 /// At most this many signals, and characters of a name.
-const MOST_SIGNALS: usize = 64;
-const LONGEST_NAME: usize = 80;
+const MAX_SIGNALS: usize = 64;
+const MAX_NAME_LENGTH: usize = 80;
 
 /// Keys that the report gives to signals of its own.
 const RESERVED: [&str; 2] = ["reward", "return"];
@@ -72,8 +72,8 @@ impl Description {
     /// What is wrong, in a sentence without its full stop.
     pub fn check(&self, spec: &EnvironmentSpec) -> Result<(), String> {
         let count = self.signals.len();
-        if count > MOST_SIGNALS {
-            return Err(format!("it has {count} signals: name at most {MOST_SIGNALS}"));
+        if count > MAX_SIGNALS {
+            return Err(format!("it has {count} signals: name at most {MAX_SIGNALS}"));
         }
         for (i, signal) in self.signals.iter().enumerate() {
             check_signal(signal, spec)?;
@@ -117,9 +117,9 @@ fn check_signal(signal: &Signal, spec: &EnvironmentSpec) -> Result<(), String> {
         source,
     } = signal;
     for (what, text) in [("key", key), ("label", label), ("unit", unit)] {
-        if text.chars().any(char::is_control) || text.chars().count() > LONGEST_NAME {
+        if text.chars().any(char::is_control) || text.chars().count() > MAX_NAME_LENGTH {
             return Err(format!(
-                "the {what} {text:?} must be one line of at most {LONGEST_NAME} characters"
+                "the {what} {text:?} must be one line of at most {MAX_NAME_LENGTH} characters"
             ));
         }
     }

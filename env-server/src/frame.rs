@@ -14,9 +14,9 @@ pub const HEIGHT_VARIABLE: &str = "SHOAL_PICTURES_HEIGHT";
 /// The format of the file.
 const FORMAT: u32 = 1;
 /// A picture has at most this many pixels on a side.
-const SIDE: usize = 4_096;
+const MAX_SIDE: usize = 4_096;
 /// Bytes of a header or a drawing, at most.
-const TEXT: u64 = 4 << 20;
+const MAX_TEXT_BYTES: u64 = 4 << 20;
 
 /// What a state looks like.
 #[derive(Clone, Debug, PartialEq)]
@@ -122,14 +122,17 @@ pub fn read(path: &Path) -> io::Result<Option<Written>> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error),
     };
-    if size > (3 * SIDE * SIDE) as u64 + TEXT {
+    if size > (3 * MAX_SIDE * MAX_SIDE) as u64 + MAX_TEXT_BYTES {
         return Err(wrong("it is too large"));
     }
     parse(&std::fs::read(path)?).map(Some)
 }
 
 fn parse(bytes: &[u8]) -> io::Result<Written> {
-    let end = bytes.iter().take(TEXT as usize).position(|byte| *byte == b'\n');
+    let end = bytes
+        .iter()
+        .take(MAX_TEXT_BYTES as usize)
+        .position(|byte| *byte == b'\n');
     let (header, rest) = end
         .map(|end| bytes.split_at(end))
         .ok_or_else(|| wrong("it has no header"))?;
@@ -146,7 +149,7 @@ fn parse(bytes: &[u8]) -> io::Result<Written> {
         Kind::None { reason } => Err(one_line(&reason)),
         Kind::Drawing => Ok(Frame::Drawing(serde_json::from_slice(rest)?)),
         Kind::Rgb { width, height } => {
-            let fits = (1..=SIDE).contains(&width) && (1..=SIDE).contains(&height);
+            let fits = (1..=MAX_SIDE).contains(&width) && (1..=MAX_SIDE).contains(&height);
             if !fits || rest.len() != 3 * width * height {
                 let size = format!("{width} × {height} pixels in {} bytes", rest.len());
                 return Err(wrong(&format!("it has {size}")));

@@ -13,12 +13,12 @@
 //! and its configuration names the program: `environment.server = ["./rail"]`.
 
 use std::fmt::Display;
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
 use serde::de::DeserializeOwned;
+use shoal_base::message::say;
 use shoal_base::role::{Role, RoleInstance};
 use shoal_base::stop::Stop;
 use shoal_base::versioned_file::VersionedFile;
@@ -92,7 +92,7 @@ pub fn serve<P: DeserializeOwned, E: Environment + 'static>(new: fn(P) -> Result
     let served = serve_until_stopped(&arguments, make);
     let Err(error) = served else { return ExitCode::SUCCESS };
     // The last line is shown to the user.
-    let _ = writeln!(std::io::stderr(), "error: environment {}: {error}", arguments.name);
+    say(format!("error: environment {}: {error}", arguments.name));
     ExitCode::FAILURE
 }
 

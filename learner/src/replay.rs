@@ -45,5 +45,5 @@ pub use shoal_common::commit::{ActorCommit, ChunkId, ReplayLayout};
 pub use self::append::{Appended, FilledChunk, ReservedChunk};
 pub use self::error::{ChunkError, ReplayError};
 pub use self::step::WriteStep;
-pub use self::store::{Replay, are_finite};
+pub use self::store::Replay;
 pub use self::sync::{PendingSync, SyncedRows};

@@ -32,7 +32,7 @@ const FEWEST_PICTURES: usize = 20;
 /// Players slow down pictures of a GIF that are shown for less than this many hundredths of a second.
 const SHORTEST_DELAY: f64 = 2.0;
 /// The greatest number of pictures in a second of an MP4.
-const MOST_FPS: f64 = 60.0;
+const MAX_FPS: f64 = 60.0;
 /// How long the last picture of an episode is shown, in s.
 const PAUSE: f64 = 0.6;
 
@@ -111,7 +111,9 @@ pub fn film(
     mut progress: impl FnMut(u32, usize),
 ) -> anyhow::Result<Shown> {
     let rollout = Rollout::of_run(run, config, request.parameters)?;
-    let mut rollout = rollout.until(interrupt.clone()).seen(request.height);
+    let mut rollout = rollout
+        .interruptible_by(interrupt.clone())
+        .with_pictures(request.height);
     let time_step = description::of_run(run, config)?.time_step;
     let pictures = match format {
         Format::Gif => PICTURES_OF_GIF,
@@ -203,7 +205,7 @@ impl<'a, W: Write> Writer<'a, W> {
             Format::Gif => To::Gif(Animation::new(file, size)?),
             Format::Mp4 => {
                 // A whole number of steps per picture.
-                let fps = rate / (rate / MOST_FPS).ceil().max(1.0);
+                let fps = rate / (rate / MAX_FPS).ceil().max(1.0);
                 let ffmpeg = Ffmpeg::start(size, fps)?;
                 To::Mp4 { file, ffmpeg, fps }
             }

@@ -5,6 +5,7 @@ mod thesis;
 use std::path::{Path, PathBuf};
 
 use shoal_common::config::Config;
+use shoal_common::message::one_line;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::description::Description;
 use shoal_run::description;
@@ -47,7 +48,7 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interr
     {
         match episode_of_server(run, config, interrupt) {
             Ok(trajectory) => drawn.files.push(episode(&description, &trajectory, out)?),
-            Err(error) => drawn.no_episode = Some(format!("{error:#}").replace('\n', " ")),
+            Err(error) => drawn.no_episode = Some(one_line(error)),
         }
     }
     Ok(drawn)
@@ -70,7 +71,9 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
 fn episode_of_server(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Trajectory> {
     let policy = SavedPolicy::Best.read(run, config)?;
     let rollout = Rollout::of_run(run, config, &policy.parameters)?;
-    rollout.until(interrupt.clone()).evaluation_episode(config.run.seed, 0)
+    rollout
+        .interruptible_by(interrupt.clone())
+        .evaluation_episode(config.run.seed, 0)
 }
 
 /// Draws the signals of an episode and returns the file.

@@ -1,11 +1,12 @@
 //! Shows the progress of a batch: one live line on a terminal, and one line for each event.
 
 use std::collections::BTreeMap;
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
 use shoal_run::records::recorder::recorded;
@@ -170,10 +171,7 @@ impl<'a> ProgressDisplay<'a> {
     }
 
     fn print(&self, line: &str) {
-        self.bar.suspend(|| {
-            // A closed stderr is no reason to fail.
-            let _ = writeln!(std::io::stderr(), "{line}");
-        });
+        self.bar.suspend(|| say(line));
     }
 }
 

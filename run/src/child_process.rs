@@ -4,6 +4,7 @@
 mod group;
 mod output;
 mod process;
+mod tied;
 
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::CommandExt;
@@ -18,6 +19,7 @@ use shoal_common::role::RoleInstance;
 pub use self::group::ChildGroup;
 pub use self::output::{ChildOutput, Line, Writer, escape_control_characters};
 pub use self::process::ChildProcess;
+pub use self::tied::{exec_tied, tied};
 
 /// The command that starts this program as a role of the run in this directory.
 pub fn role_command(instance: RoleInstance, run: &Path) -> Command {
@@ -32,16 +34,16 @@ pub fn role_command(instance: RoleInstance, run: &Path) -> Command {
     command
 }
 
-/// Waits at most `most` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.
+/// Waits at most `timeout` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.
 /// Returns whether that happened. A signal to this process ends the wait early.
-pub fn wait_for_any(wakers: &[BorrowedFd<'_>], most: Duration) -> bool {
+pub fn wait_for_any(wakers: &[BorrowedFd<'_>], timeout: Duration) -> bool {
     let mut ready: Vec<_> = wakers
         .iter()
         .map(|waker| PollFd::from_borrowed_fd(*waker, PollFlags::IN))
         .collect();
     // Only an absurdly long wait cannot be represented; it becomes one without a limit.
-    let most = Timespec::try_from(most).ok();
-    match poll(&mut ready, most.as_ref()) {
+    let timeout = Timespec::try_from(timeout).ok();
+    match poll(&mut ready, timeout.as_ref()) {
         Ok(ready) => ready > 0,
         Err(Errno::INTR) => false,
         Err(_) => {

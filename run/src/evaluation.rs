@@ -8,8 +8,8 @@ pub mod frames;
 pub mod rollout;
 
 use serde::{Deserialize, Serialize};
-use shoal_actor::evaluator::mean_and_std;
 use shoal_common::config::Config;
+use shoal_common::numbers::mean_and_std;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
@@ -76,7 +76,7 @@ pub fn evaluate_policy(
     interrupt: &Interrupt,
     progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
-    let rollout = Rollout::of_run(run, config, parameters)?.until(interrupt.clone());
+    let rollout = Rollout::of_run(run, config, parameters)?.interruptible_by(interrupt.clone());
     evaluate_by(rollout, description::of_run(run, config)?.goal, amount, progress)
 }
 

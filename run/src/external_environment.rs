@@ -5,35 +5,31 @@ mod parameters;
 pub mod server_location;
 
 use std::cell::Cell;
-use std::ffi::OsString;
-use std::io::Write;
 use std::os::fd::AsFd;
-use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::path::{Path, PathBuf};
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
 use std::process::{Command, ExitCode, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
-use rustix::process::{
-    Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
-    set_parent_process_death_signal,
-};
+use rustix::process::{Pid, PidfdFlags, Signal, getpid, kill_process, pidfd_open};
 use shoal_common::channel::environment::{
     EnvironmentClient, EnvironmentResponse, ResetRequest, ResponseFault, StepResult, describe,
 };
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
+use shoal_common::message::say;
 use shoal_common::role::Role;
 use shoal_common::space::EnvironmentSpec;
-use shoal_common::stop::{GRACE, Stop};
+use shoal_common::stop::{GRACE, Stop, kill_this_group};
 use shoal_common::versioned_file::{VersionedFile, VersionedFileError};
 use shoal_env_server::description::{self, Description};
 use shoal_env_server::frame::{self, Written};
 
-use crate::child_process::{ChildProcess, wait_for_any};
+use crate::child_process::{ChildProcess, tied, wait_for_any};
 use crate::external_environment::server_location::ServerSurroundings;
 use crate::signals::{Interrupt, describe as describe_signal};
 
@@ -133,56 +129,6 @@ impl LaunchSpec<'_> {
     }
 }
 
-/// The hidden command that replaces itself by another program, which is killed when its parent process dies.
-pub const TIED_COMMAND: &str = "tied";
-
-/// The command that starts `program` tied to this process: it is killed whenever this process dies.
-///
-/// # Errors
-/// When there is no such program.
-pub fn tied(program: &Command) -> anyhow::Result<Command> {
-    let name = Path::new(program.get_program());
-    let in_path = || {
-        let path = std::env::var_os("PATH").unwrap_or_default();
-        std::env::split_paths(&path).any(|directory| directory.join(name).is_file())
-    };
-    if !name.is_file() && (name.components().count() > 1 || !in_path()) {
-        bail!("{}: there is no such file", cannot_start(program));
-    }
-    let mut command = Command::new("/proc/self/exe");
-    command
-        .arg0("shoal")
-        .args([TIED_COMMAND, &std::process::id().to_string()]);
-    command.arg(program.get_program()).args(program.get_args());
-    if let Some(directory) = program.get_current_dir() {
-        command.current_dir(directory);
-    }
-    for (name, value) in program.get_envs() {
-        match value {
-            Some(value) => command.env(name, value),
-            None => command.env_remove(name),
-        };
-    }
-    Ok(command)
-}
-
-/// Carries out [`TIED_COMMAND`]: ties this process to `parent` and replaces it by the program. Returns only on errors.
-///
-/// # Errors
-/// When the program cannot be started.
-pub fn exec_tied(parent: u32, command_line: &[OsString]) -> anyhow::Result<ExitCode> {
-    let Some((program, arguments)) = command_line.split_first() else {
-        bail!("there is no program to start");
-    };
-    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot tie the program to its parent process")?;
-    if getppid().map(Pid::as_raw_pid) != Some(parent as i32) {
-        bail!("the parent process has ended");
-    }
-    let mut command = Command::new(program);
-    let cause = command.args(arguments).exec();
-    Err(anyhow::Error::from(cause).context(cannot_start(&command)))
-}
-
 /// Serves as the role by running the program, and ends as it ends. The program inherits this process's standard input
 /// and standard error. If it has not ended [`GRACE`] after its standard input closed, this kills the process group, so
 /// that a program that is stuck does not outlive its run.
@@ -190,7 +136,8 @@ pub fn exec_tied(parent: u32, command_line: &[OsString]) -> anyhow::Result<ExitC
 /// # Errors
 /// When the program cannot be started or watched.
 pub fn serve_with(program: &Command) -> anyhow::Result<ExitCode> {
-    let mut child = tied(program)?
+    let mut command = tied(program).with_context(|| cannot_start(program))?;
+    let mut child = command
         .stdout(Stdio::null())
         .spawn()
         .with_context(|| cannot_start(program))?;
@@ -213,20 +160,12 @@ pub fn serve_with(program: &Command) -> anyhow::Result<ExitCode> {
         let left = deadline.saturating_duration_since(Instant::now());
         let left = Timespec::try_from(left).context("the time limit is too long")?;
         match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&left)) {
-            Ok(0) => return kill_this_group(),
+            Ok(0) => kill_this_group(),
             Ok(_) => return end_as(child.wait()?),
             Err(Errno::INTR) => {}
             Err(cause) => return Err(anyhow::Error::from(cause).context("cannot watch the environment server")),
         }
     }
-}
-
-fn kill_this_group() -> anyhow::Result<ExitCode> {
-    if getpgrp() == getpid() {
-        kill_process_group(getpgrp(), Signal::KILL)?;
-    }
-    kill_process(getpid(), Signal::KILL)?;
-    Ok(ExitCode::FAILURE)
 }
 
 /// Ends this process with the same signal or exit code as another.
@@ -483,7 +422,8 @@ fn open(
     services.create_common(domain)?;
     services.create_environment(domain, launch.index)?;
     let listener = Listener::bind(domain, launch.client)?;
-    let mut program = ChildProcess::start(&mut tied(&command)?, "environment server".into())
+    let mut program = tied(&command)
+        .and_then(|mut command| Ok(ChildProcess::start(&mut command, "environment server".into())?))
         .with_context(|| cannot_start(&command))?;
     let has_answered = Stop::default();
     let stop = stop_when_it_ends(&program, has_answered.clone(), environment)?;
@@ -533,13 +473,12 @@ fn stop_when_it_ends(
     std::thread::Builder::new()
         .name("watch".into())
         .spawn(move || {
-            let ended = |most| wait_for_any(&[process.as_fd()], most);
+            let ended = |timeout| wait_for_any(&[process.as_fd()], timeout);
             if !ended(SLOW.min(limit)) && !has_answered.requested() {
-                let _ = writeln!(
-                    std::io::stderr(),
+                say(format!(
                     "waiting for {name} to start, for at most {} s",
                     limit.as_secs()
-                );
+                ));
             }
             if !ended(limit.saturating_sub(SLOW)) && has_answered.requested() {
                 while !ended(Duration::MAX) {}

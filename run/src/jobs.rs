@@ -17,6 +17,12 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Interval at which a received signal is checked.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
 
+/// The number of trainings that keep the cores of this machine busy; each takes about two.
+pub fn trainings_for_all_cores() -> usize {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    (cores / 2).max(1)
+}
+
 /// How a training ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrainingEnd {

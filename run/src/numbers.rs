@@ -17,7 +17,7 @@ const EXACT: f64 = 9_007_199_254_740_992.0;
 ///
 /// # Errors
 /// When the text is no whole number from 0 to 2^64 − 1.
-pub fn count(text: &str) -> Result<u64, String> {
+pub fn parse_count(text: &str) -> Result<u64, String> {
     let refused = || format!("{text} is not a whole number, such as 1000, 1e5, 30k or 1M");
     let plain = text.replace('_', "");
     if let Ok(number) = plain.parse() {
@@ -40,20 +40,20 @@ pub fn count(text: &str) -> Result<u64, String> {
     Ok(number as u64)
 }
 
-/// A [`count`] that fits into 32 bits.
+/// A count that fits into 32 bits.
 ///
 /// # Errors
 /// When the text is no whole number from 0 to 2^32 − 1.
-pub fn small_count(text: &str) -> Result<u32, String> {
-    u32::try_from(count(text)?).map_err(|_| format!("{text} is too large: at most {}", u32::MAX))
+pub fn parse_small_count(text: &str) -> Result<u32, String> {
+    u32::try_from(parse_count(text)?).map_err(|_| format!("{text} is too large: at most {}", u32::MAX))
 }
 
-/// A [`small_count`] that is not 0.
+/// A count of 32 bits that is not 0.
 ///
 /// # Errors
 /// When the text is no whole number from 1 to 2^32 − 1.
-pub fn from_one(text: &str) -> Result<u32, String> {
-    match small_count(text)? {
+pub fn parse_positive_count(text: &str) -> Result<u32, String> {
+    match parse_small_count(text)? {
         0 => Err("0 is too small: at least 1".into()),
         number => Ok(number),
     }
@@ -78,18 +78,18 @@ mod tests {
             ("2.0", 2),
             ("18446744073709551615", u64::MAX),
         ] {
-            assert_eq!(count(text), Ok(number), "{text}");
+            assert_eq!(parse_count(text), Ok(number), "{text}");
         }
         for text in [
             "", "1.5", "1e-3", "-1", "1e3k", "k", "1e30", "1m", "inf", "nan", "0x10", "1 k", "e5",
         ] {
-            let refused = count(text).unwrap_err();
+            let refused = parse_count(text).unwrap_err();
             assert!(
                 refused.contains("not a whole number") && !refused.contains('\n'),
                 "{refused}"
             );
         }
-        assert_eq!(small_count("5k"), Ok(5_000));
-        assert!(small_count("1e10").is_err());
+        assert_eq!(parse_small_count("5k"), Ok(5_000));
+        assert!(parse_small_count("1e10").is_err());
     }
 }

@@ -25,6 +25,7 @@ use self::resolve::{Resolved, resolve_all};
 pub use self::resolve::{resolve, resolve_preset, resolve_with_sources};
 use self::revision::as_written;
 pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
+pub use self::sections::is_configuration_file;
 pub use self::source::{SettingSource, SettingSources};
 
 use crate::demonstrations::Demonstrations;

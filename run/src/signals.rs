@@ -32,8 +32,8 @@ static RECEIVERS: Mutex<usize> = Mutex::new(0);
 /// Whether there is none.
 static NOBODY: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
 
-/// Counts one receiver more or less.
-fn count(change: impl FnOnce(usize) -> usize) {
+/// Changes the number of receivers.
+fn change_receivers(change: impl FnOnce(usize) -> usize) {
     let mut receivers = RECEIVERS.lock().unwrap_or_else(PoisonError::into_inner);
     *receivers = change(*receivers);
     NOBODY.store(*receivers == 0, Ordering::Relaxed);
@@ -71,8 +71,8 @@ impl Signals {
             Ok(Self { last, wake })
         };
         // Before the first handler: one that an earlier receiver has left must not end the process either.
-        count(|receivers| receivers + 1);
-        let signals = registered().inspect_err(|_| count(|receivers| receivers - 1));
+        change_receivers(|receivers| receivers + 1);
+        let signals = registered().inspect_err(|_| change_receivers(|receivers| receivers - 1));
         signals.context("cannot watch for signals")
     }
 
@@ -105,7 +105,7 @@ impl AsFd for Signals {
 
 impl Drop for Signals {
     fn drop(&mut self) {
-        count(|receivers| receivers - 1);
+        change_receivers(|receivers| receivers - 1);
     }
 }
 

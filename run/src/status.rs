@@ -54,11 +54,8 @@ fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Res
 
 /// Rows committed to a run's replay; 0 if it has none yet.
 pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
-    match CommitReader::open(&run.replay_file()) {
-        Ok(reader) => Ok(reader.rows()),
-        Err(OpenError::NotYet { .. }) => Ok(0),
-        Err(error) => Err(error),
-    }
+    let commits = CommitReader::open_if_ready(&run.replay_file())?;
+    Ok(commits.map_or(0, |commits| commits.rows()))
 }
 
 /// The evaluation period of the policy that was evaluated last, by the evaluator's state and the run's records. Earlier

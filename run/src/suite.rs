@@ -18,11 +18,11 @@ use shoal_common::versioned_file::VersionedFile;
 
 use crate::records::start;
 
-/// Most runs in a suite.
-const MOST: usize = 10_000;
+/// The most runs that a suite has.
+const MAX_RUNS: usize = 10_000;
 
-/// Most characters of a run's name.
-const NAME: usize = 200;
+/// The most characters that a run's name has.
+const MAX_NAME_LENGTH: usize = 200;
 
 /// What a suite consists of: `suite.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -140,7 +140,7 @@ pub fn seeds(text: &str) -> Result<Vec<u64>, String> {
             None => seeds.push(number(part)?),
             Some((first, last)) => {
                 let (first, last) = (number(first)?, number(last)?);
-                if last < first || last - first >= MOST as u64 {
+                if last < first || last - first >= MAX_RUNS as u64 {
                     return Err(form());
                 }
                 seeds.extend(first..=last);
@@ -174,8 +174,8 @@ impl Suite {
             .iter()
             .map(|sweep| sweep.values.len())
             .try_fold(seeds.len().max(1), usize::checked_mul);
-        if all.is_none_or(|all| all > MOST) {
-            bail!("a suite of more than {MOST} runs: sweep fewer values");
+        if all.is_none_or(|all| all > MAX_RUNS) {
+            bail!("a suite of more than {MAX_RUNS} runs: sweep fewer values");
         }
         let mut combinations: Vec<Vec<(&str, &str)>> = vec![Vec::new()];
         for Sweep { key, values } in sweeps {
@@ -288,7 +288,7 @@ impl Suite {
     }
 
     /// Whether a run was ended early.
-    pub fn has_ended(&self, trial: &Trial) -> bool {
+    pub fn was_ended_early(&self, trial: &Trial) -> bool {
         let ended = self.halving.iter().flat_map(|halving| halving.ended.iter().flatten());
         ended.into_iter().any(|name| *name == trial.name)
     }
@@ -301,7 +301,7 @@ impl Suite {
             trials: self
                 .trials
                 .iter()
-                .filter(|trial| !self.has_ended(trial))
+                .filter(|trial| !self.was_ended_early(trial))
                 .cloned()
                 .collect(),
             share: 0.5_f64.powi((rounds - completed) as i32),
@@ -312,7 +312,7 @@ impl Suite {
     /// the runs whose result is not finite. Returns the names of the ended runs.
     pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
         let mut left = self.settings();
-        left.retain(|setting| !self.has_ended(&self.trials[setting[0]]));
+        left.retain(|setting| !self.was_ended_early(&self.trials[setting[0]]));
         let mean = |setting: &Vec<usize>| {
             let results = setting.iter().map(|number| result(&self.trials[*number]));
             let results: Vec<f64> = results.filter(|result| result.is_finite()).collect();
@@ -417,7 +417,7 @@ fn name(chosen: &[(&str, &str)], sweeps: &[Sweep], seed: Option<u64>) -> String 
         .chars()
         .map(|c| if is_plain(c) { c } else { '-' })
         .collect();
-    let name: String = name.chars().take(NAME).collect();
+    let name: String = name.chars().take(MAX_NAME_LENGTH).collect();
     match name.trim_start_matches('.') {
         "" => "run".into(),
         name => name.into(),
@@ -506,7 +506,11 @@ mod tests {
                 (0.5, 4, names(&[4]))
             ]
         );
-        let left: Vec<&Trial> = suite.trials.iter().filter(|trial| !suite.has_ended(trial)).collect();
+        let left: Vec<&Trial> = suite
+            .trials
+            .iter()
+            .filter(|trial| !suite.was_ended_early(trial))
+            .collect();
         assert_eq!(
             left.iter().map(|trial| &trial.name).collect::<Vec<_>>(),
             ["tau=5,seed=1", "tau=5,seed=2"]

@@ -3,7 +3,6 @@
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{Read, Seek, Write};
-use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
@@ -13,6 +12,7 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::file_lock;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
 use shoal_run::records::outcome::FINAL_EVALUATION;
@@ -57,7 +57,7 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
         Ok(works && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
-    resume(path, (arguments, patience), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, patience), output, is_at_work, how_to_end)
 }
 
 /// As [`resume_run`] for a suite. Returns when a process trains one of its runs.
@@ -72,10 +72,10 @@ pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputM
         Ok(file_lock::is_locked(&File::open(path)?)? && runs.any(|run| run.is_running().unwrap_or(false)))
     };
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
-    resume(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
 }
 
-fn resume(
+fn start_detached(
     path: &Path,
     (arguments, patience): (&[OsString], Duration),
     output: &OutputMode,
@@ -97,7 +97,8 @@ fn resume(
     let pid = child.id();
     let is_by_child = |since: &mut Option<Instant>| {
         let since = *since.get_or_insert_with(Instant::now);
-        holds_lock(pid, &path) || since.elapsed() >= REFUSED_END
+        let holders = path.metadata().map(|directory| file_lock::holders(&directory));
+        holders.is_ok_and(|holders| holders.contains(&(pid as i32))) || since.elapsed() >= REFUSED_END
     };
     let begun = Instant::now();
     let mut is_over = false;
@@ -132,28 +133,13 @@ fn resume(
                 how_to_end(&here.to_string(), pid)
             ),
         };
-        // A terminal that is gone is no failure.
-        let _ = writeln!(std::io::stderr(), "{here} {what}");
+        say(format!("{here} {what}"));
     }
     if output.json {
         let printed = serde_json::to_string(&Printed { run: &path, pid })?;
         writeln!(std::io::stdout(), "{printed}")?;
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// Whether the system says that this process holds the lock of the directory. Some file systems show other inodes there.
-fn holds_lock(pid: u32, directory: &Path) -> bool {
-    let (Ok(locks), Ok(directory)) = (std::fs::read_to_string("/proc/locks"), directory.metadata()) else {
-        return false;
-    };
-    // As in `1: FLOCK  ADVISORY  WRITE 4711 08:01:1234 0 EOF`.
-    locks.lines().any(|line| {
-        let mut fields = line.split_whitespace().skip(4);
-        let (owner, file) = (fields.next(), fields.next().unwrap_or_default());
-        let inode = file.rsplit(':').next().and_then(|inode| inode.parse().ok());
-        owner == Some(&pid.to_string()) && inode == Some(directory.ino())
-    })
 }
 
 /// Asks the launcher to end in order.
@@ -168,7 +154,7 @@ fn write_messages(messages: &mut File) -> anyhow::Result<()> {
     let mut text = Vec::new();
     messages.rewind()?;
     messages.read_to_end(&mut text)?;
-    // As above.
+    // As in `say`.
     let _ = std::io::stderr().write_all(&text);
     Ok(())
 }

@@ -12,7 +12,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
-use shoal_run::numbers::{count, from_one};
+use shoal_run::numbers::{parse_count, parse_positive_count};
 use shoal_run::signals::{Signals, describe, exit_code};
 
 #[derive(Args, Clone, Debug)]
@@ -23,10 +23,10 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: SavedPolicy,
     /// Number of episodes. Their start states are the same every time.
-    #[arg(long, default_value_t = 100, value_parser = from_one)]
+    #[arg(long, default_value_t = 100, value_parser = parse_positive_count)]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long, value_parser = count)]
+    #[arg(long, value_parser = parse_count)]
     pub(crate) seed: Option<u64>,
     /// Print one JSON object on standard output.
     #[arg(long)]

@@ -1,19 +1,19 @@
 //! `shoal film`: plays a run's policy and writes what is seen into a GIF or a video.
 
-use std::fs::File;
-use std::io::{ErrorKind, Read, Write};
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use shoal_common::run_dir::RunDir;
 use shoal_report::film::{Format, Request, Shown, film};
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::numbers::{count, thousands};
+use shoal_run::numbers::{parse_count, thousands};
 use shoal_run::signals::{Signals, describe, exit_code};
+
+use super::output_file::check_replaceable;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct FilmArgs {
@@ -26,7 +26,7 @@ pub(crate) struct FilmArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=50))]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long, value_parser = count)]
+    #[arg(long, value_parser = parse_count)]
     pub(crate) seed: Option<u64>,
     /// The file to write; its name ends in .gif or, for a video made by the program ffmpeg, in .mp4 [default: film.gif
     /// in the run directory].
@@ -36,7 +36,7 @@ pub(crate) struct FilmArgs {
     #[arg(long, value_name = "PIXELS", default_value_t = 320, value_parser = clap::value_parser!(u32).range(32..=2048))]
     pub(crate) size: u32,
     /// Steps shown in a second [default: as many as the environment's time says].
-    #[arg(long, value_name = "STEPS", value_parser = positive)]
+    #[arg(long, value_name = "STEPS", value_parser = parse_steps_per_second)]
     pub(crate) fps: Option<f64>,
 }
 
@@ -44,7 +44,7 @@ pub(crate) struct FilmArgs {
 const NAME: &str = "film.gif";
 
 /// Steps in a second, from 0.1 to 1,000.
-fn positive(text: &str) -> Result<f64, String> {
+fn parse_steps_per_second(text: &str) -> Result<f64, String> {
     let fps = text.parse().ok().filter(|fps| (0.1..=1_000.0).contains(fps));
     fps.ok_or_else(|| "give a number from 0.1 to 1000".into())
 }
@@ -56,7 +56,7 @@ pub(crate) fn run(args: &FilmArgs) -> anyhow::Result<ExitCode> {
     let policy = args.policy.read(&run, &config)?;
     let out = args.out.clone().unwrap_or_else(|| run.path().join(NAME));
     let format = Format::of(&out)?;
-    check_replaceable(&out, format)?;
+    check_replaceable(&out, "a film", |start| format.is(start))?;
     let request = Request {
         parameters: &policy.parameters,
         episodes: args.episodes,
@@ -100,22 +100,4 @@ fn in_words(shown: &Shown) -> String {
     let episode = |(episode_return, steps): &(f64, usize)| format!("return {episode_return:.2} in {steps} steps");
     let episodes: Vec<String> = shown.episodes.iter().map(episode).collect();
     format!("a film of {:.1} s: {}", shown.seconds, episodes.join("; "))
-}
-
-/// Checks that `out` does not exist or is a film of this format: no other file is replaced.
-fn check_replaceable(out: &Path, format: Format) -> anyhow::Result<()> {
-    if out.is_dir() {
-        bail!("{} is a directory: give --out the name of a file", out.display());
-    }
-    let mut start = Vec::new();
-    match File::open(out).and_then(|file| file.take(16).read_to_end(&mut start)) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
-        read => read.with_context(|| format!("cannot read {}; choose another file with --out", out.display()))?,
-    };
-    ensure!(
-        format.is(&start),
-        "{} exists and is no film: choose another file with --out, or remove it",
-        out.display()
-    );
-    Ok(())
 }

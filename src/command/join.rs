@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use shoal_run::numbers::small_count;
+use shoal_run::numbers::parse_small_count;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
@@ -18,10 +18,10 @@ pub(crate) struct JoinArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.
-    #[arg(long, value_name = "N", value_parser = small_count, required_unless_present = "template")]
+    #[arg(long, value_name = "N", value_parser = parse_small_count, required_unless_present = "template")]
     pub(crate) actors: Option<u32>,
     /// End, with exit code 4, if the run cannot be reached for this long, as in 90s, 10min or 2h.
-    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = time)]
+    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = parse_duration)]
     pub(crate) give_up: Duration,
     /// The host's name in `status` [default: the machine's].
     #[arg(long, value_name = "NAME")]
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// Reads a time such as `90s`, `10min` or `2h`.
-fn time(text: &str) -> Result<Duration, String> {
+fn parse_duration(text: &str) -> Result<Duration, String> {
     let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let (number, unit) = text.split_at(digits);
     let seconds = match unit {
@@ -96,6 +96,7 @@ mod with_network {
     use std::path::Path;
 
     use anyhow::{Context, bail};
+    use shoal_common::message::say;
     use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
@@ -112,6 +113,15 @@ mod with_network {
 
     /// The exit code if the run could not be reached for too long.
     const GAVE_UP: u8 = 4;
+
+    /// This host, as the run knows it, and how it reaches the run.
+    struct JoiningHost {
+        number: u64,
+        name: String,
+        endpoint: Endpoint,
+        /// `None` if the connection is not encrypted.
+        key: Option<KeyFile>,
+    }
 
     /// Joins the run, and works for it until it is over. A host that has lost its actors joins again.
     pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
@@ -138,14 +148,14 @@ mod with_network {
         time: u32,
     ) -> anyhow::Result<Option<ExitCode>> {
         let interrupt = signals.interrupt();
-        let host = host_number()?;
+        let number = host_number()?;
         let name = match &args.name {
             Some(name) => name.clone(),
             None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
         };
         let hello = Hello {
             program: env!("CARGO_PKG_VERSION").into(),
-            host,
+            host: number,
             name: name.clone(),
             instructions: vector_instructions(),
             actors,
@@ -164,23 +174,29 @@ mod with_network {
                 return Ok(Some(ExitCode::SUCCESS));
             }
             Err(error @ JoinError::Silence { .. }) => {
-                say(&format!("error: {error}"));
+                say(format!("error: {error}"));
                 return Ok(Some(GAVE_UP.into()));
             }
             Err(error) => return Err(error.into()),
         };
-        let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
+        let temporary = std::env::temp_dir().join(format!("shoal-join-{number:016x}"));
         let path = match (&args.local, time) {
             (None, _) => temporary,
             (Some(local), 1) => local.clone(),
             (Some(local), _) => PathBuf::from(format!("{}-{time}", local.display())),
         };
         let path = path.as_path();
-        let worked = work(args, (endpoint, key, host, name), (lease, connection), path, signals);
+        let host = JoiningHost {
+            number,
+            name,
+            endpoint,
+            key,
+        };
+        let worked = work(args, host, (lease, connection), path, signals);
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
-                Err(_) => say(&format!("the log of this host is {}", path.join("shoal.log").display())),
+                Err(_) => say(format!("the log of this host is {}", path.join("shoal.log").display())),
             }
         }
         worked
@@ -188,29 +204,35 @@ mod with_network {
 
     fn work(
         args: &JoinArgs,
-        (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
+        host: JoiningHost,
         (lease, connection): (WireLease, GateConnection),
         path: &Path,
         signals: &Signals,
     ) -> anyhow::Result<Option<ExitCode>> {
+        let JoiningHost {
+            number,
+            name,
+            endpoint,
+            key,
+        } = host;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
         // The environment may take minutes to start, and it may not be usable here.
-        let keeper = LeaseKeeper::start(connection, run_id.clone(), host)?;
+        let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
         let prepare = || {
             let interrupt = signals.interrupt();
             let made = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
             if let Some(key) = key {
                 key.write(&made.1.path().join(KeyFile::JOIN))?;
             }
-            HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&made.1)?;
+            HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&made.1)?;
             anyhow::Ok(made)
         };
         let prepared = prepare();
         keeper.end(prepared.is_err());
         let (config, run, lock) = prepared?;
         let actors = lease.actors.clone();
-        say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
+        say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
         Ok(Some(match ending {
             JoinEnd::Over => {
@@ -221,18 +243,13 @@ mod with_network {
             JoinEnd::Stopped => ExitCode::SUCCESS,
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {
-                say(&format!(
+                say(format!(
                     "error: {endpoint} could not be reached for {} s",
                     args.give_up.as_secs()
                 ));
                 GAVE_UP.into()
             }
         }))
-    }
-
-    fn say(line: &str) {
-        // A terminal that is gone must not make the work a failure.
-        let _ = writeln!(std::io::stderr(), "{line}");
     }
 
     /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.
@@ -291,11 +308,11 @@ mod tests {
 
     #[test]
     fn a_time_has_a_number_and_a_unit() {
-        assert_eq!(time("90s"), Ok(Duration::from_secs(90)));
-        assert_eq!(time("10min"), Ok(Duration::from_secs(600)));
-        assert_eq!(time("2h"), Ok(Duration::from_secs(7200)));
+        assert_eq!(parse_duration("90s"), Ok(Duration::from_secs(90)));
+        assert_eq!(parse_duration("10min"), Ok(Duration::from_secs(600)));
+        assert_eq!(parse_duration("2h"), Ok(Duration::from_secs(7200)));
         for wrong in ["", "10", "s", "-1s", "1.5h", "1d", "99999999999s"] {
-            assert!(time(wrong).is_err(), "{wrong}");
+            assert!(parse_duration(wrong).is_err(), "{wrong}");
         }
     }
 }

@@ -1,12 +1,12 @@
 //! `--listen`, of `train` and `resume`: other hosts may join the run.
 
 use std::ffi::OsString;
-use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
 use shoal_common::config::Config;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_remote::NOT_BUILT;
 use shoal_remote::endpoint::Endpoint;
@@ -101,8 +101,7 @@ impl ListenArgs {
             let key = make_keys(config, run, self.new_keys)?;
             line += &format!(" --key {}", key.display());
         }
-        // As everywhere, a terminal that is gone must not make the run a failure.
-        let _ = writeln!(std::io::stderr(), "{line} --actors N");
+        say(format!("{line} --actors N"));
         Ok(true)
     }
 }

@@ -1,7 +1,7 @@
 //! `shoal report`: an interactive report of one or several runs in a single HTML file.
 
-use std::io::{ErrorKind, Read, Write};
-use std::path::{Path, PathBuf};
+use std::io::Write;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
@@ -12,6 +12,8 @@ use shoal_common::run_dir::RunDir;
 use shoal_report::page::{self, MARK};
 use shoal_run::records::start::StartRecord;
 use shoal_run::suite::Suite;
+
+use super::output_file::check_replaceable;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ReportArgs {
@@ -37,7 +39,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
             .join(NAME),
         (None, _) => NAME.into(),
     };
-    check_replaceable(&out)?;
+    check_replaceable(&out, "a report", |start| start.starts_with(MARK.as_bytes()))?;
     let suite = match &args.runs[..] {
         [one] if Suite::read(one)?.is_some() => StartRecord::read(one)?,
         _ => None,
@@ -80,26 +82,10 @@ fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
     Ok(runs)
 }
 
-/// Checks that `out` does not exist or is a report: no other file is replaced.
-fn check_replaceable(out: &Path) -> anyhow::Result<()> {
-    if out.is_dir() {
-        bail!("{} is a directory: give --out the name of a file", out.display());
-    }
-    let mut start = Vec::new();
-    match std::fs::File::open(out).and_then(|file| file.take(MARK.len() as u64).read_to_end(&mut start)) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
-        read => read.with_context(|| format!("cannot read {}; choose another file with --out", out.display()))?,
-    };
-    ensure!(
-        start == MARK.as_bytes(),
-        "{} exists and is not a report: choose another file with --out, or remove it",
-        out.display()
-    );
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use shoal_run::testing::small;
 

@@ -9,7 +9,8 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use shoal_report::figure::CAN_RASTERISE;
 use shoal_reproduce::{Effort, ReproductionEnd, Request};
-use shoal_run::numbers::from_one;
+use shoal_run::jobs::trainings_for_all_cores;
+use shoal_run::numbers::parse_positive_count;
 use shoal_run::signals::exit_code;
 
 /// Repeating an interrupted command continues it. Finished trainings are not run again.
@@ -19,7 +20,7 @@ pub(crate) struct ReproduceArgs {
     #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(choices()))]
     pub(crate) experiments: Vec<String>,
     /// Run seeds 1 to N of each experiment [default: 5; 10 to 30 for frozen-lake and cart-pole; 2 with --quick].
-    #[arg(long, value_name = "N", value_parser = from_one)]
+    #[arg(long, value_name = "N", value_parser = parse_positive_count)]
     pub(crate) seeds: Option<u32>,
     /// Number of trainings at a time [default: half the cores, because each training keeps about two busy].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
@@ -46,12 +47,6 @@ pub(crate) fn choices() -> Vec<&'static str> {
     shoal_reproduce::names().chain([ALL]).collect()
 }
 
-/// The number of trainings that keep this machine busy; each takes about two cores.
-fn usual_jobs() -> usize {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    (cores / 2).max(1)
-}
-
 /// Runs the chosen experiments and prints the path of the report.
 pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     if args.png && !CAN_RASTERISE {
@@ -68,7 +63,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     let request = Request {
         experiments: if all { Vec::new() } else { args.experiments.clone() },
         seeds: args.seeds,
-        jobs: args.jobs.map_or_else(usual_jobs, usize::from),
+        jobs: args.jobs.map_or_else(trainings_for_all_cores, usize::from),
         effort,
         folder,
         png: args.png,

@@ -1,18 +1,18 @@
 //! `shoal resume`: continues a run that was stopped or killed.
 
 use std::ffi::OsString;
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::external_environment::server_location::ServerLocation;
-use shoal_run::numbers::count;
+use shoal_run::numbers::parse_count;
 use shoal_run::origin::Origin;
 use shoal_run::plan::{RequestedChanges, Revision, warning};
 use shoal_run::records::recorder::{ChangeRecord, Moment};
@@ -32,10 +32,10 @@ pub(crate) struct ResumeArgs {
     /// Run directory, or the directory of a suite.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     pub(crate) steps: Option<u64>,
     /// Episodes of all actors together, including those already finished [default: as before].
-    #[arg(long, value_name = "M", value_parser = count)]
+    #[arg(long, value_name = "M", value_parser = parse_count)]
     pub(crate) episodes: Option<u64>,
     /// Change a key that may change in a run, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
@@ -140,11 +140,11 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         let line = format!("{key} changes from {before} to {after} at step {env_steps} ({source})");
         launcher::note(&run, &line);
         if !args.output.quiet {
-            let _ = writeln!(std::io::stderr(), "{line}");
+            say(line);
         }
     }
     if let Some(warning) = warning(config) {
-        let _ = writeln!(std::io::stderr(), "warning: {warning}");
+        say(format!("warning: {warning}"));
     }
     run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
@@ -180,7 +180,7 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     let has_other_episodes = SavedPolicy::Best
         .read(run, config)
         .is_ok_and(|best| ![0, episodes].contains(&best.episodes));
-    let (evaluated, why) = if revision.changes("evaluation.episodes") {
+    let (evaluated, why) = if revision.changes_key("evaluation.episodes") {
         (
             reevaluate_best(run, config, &interrupt),
             "the number of episodes has changed",
@@ -198,21 +198,16 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     };
     match (evaluated, interrupt.signal()) {
         (Err(_), Some(signal)) => {
-            let _ = writeln!(
-                std::io::stderr(),
-                "ended by {}; nothing has changed in {here}",
-                describe(signal)
-            );
+            say(format!("ended by {}; nothing has changed in {here}", describe(signal)));
             Ok(Some(signal))
         }
         (evaluated, signal) => {
             let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
             if let Some(ReevaluatedPolicy { before, now }) = evaluated {
-                let _ = writeln!(
-                    std::io::stderr(),
+                say(format!(
                     "the best policy is re-evaluated, because {why}: {:.2} instead of {before:.2}",
                     now.return_mean
-                );
+                ));
             }
             Ok(signal)
         }

@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use clap::Args;
 use shoal_run::client::RunClient;
-use shoal_run::numbers::small_count;
+use shoal_run::numbers::parse_small_count;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ScaleArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
     /// New number of actor processes.
-    #[arg(long, value_name = "N", value_parser = small_count)]
+    #[arg(long, value_name = "N", value_parser = parse_small_count)]
     pub(crate) actors: u32,
 }
 

@@ -10,10 +10,12 @@ use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
-use shoal_common::channel::control::{HostState, HostStatus, RoleState, RunStatus};
+use shoal_common::channel::control::{HostStatus, RoleState, RunStatus};
 use shoal_run::client::RunClient;
 use shoal_run::numbers::thousands;
 use shoal_run::status::saved_status;
+
+use crate::status_table::{HOST_COLUMNS, ROLE_COLUMNS, host_cells, progress, role_cells, waiting};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct StatusArgs {
@@ -112,40 +114,11 @@ fn screen() -> ProgressBar {
     screen
 }
 
-/// The run's progress in words.
-pub(crate) fn progress(status: &RunStatus) -> String {
-    let updates = thousands(status.updates);
-    match status.episodes_limit {
-        Some(limit) => format!(
-            "{} of {} episodes, {} steps, {updates} updates",
-            thousands(status.episodes),
-            thousands(limit),
-            thousands(status.env_steps)
-        ),
-        None => format!(
-            "{} of {} steps, {updates} updates",
-            thousands(status.env_steps),
-            thousands(status.steps)
-        ),
-    }
-}
-
 fn table(status: &RunStatus) -> String {
     let mut table = Table::new();
     table.load_style(NOTHING);
-    table.set_header(["role", "pid", "state", "restarts", "rate", "policy", "lag"]);
-    for role in &status.roles {
-        let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
-        table.add_row([
-            format!("{} {}", role.role, role.index),
-            role.pid.map_or_else(String::new, |pid| pid.to_string()),
-            state_name(role.state).into(),
-            role.restarts.to_string(),
-            format!("{:.0}/s", role.rate),
-            or_none(role.policy_version),
-            or_none(role.policy_lag),
-        ]);
-    }
+    table.set_header(ROLE_COLUMNS);
+    table.add_rows(status.roles.iter().map(role_cells));
     for column in [1, 3, 4, 5, 6] {
         if let Some(column) = table.column_mut(column) {
             column.set_cell_alignment(CellAlignment::Right);
@@ -171,28 +144,6 @@ fn table(status: &RunStatus) -> String {
     )
 }
 
-/// The columns of a table of hosts.
-pub(crate) const HOST_COLUMNS: [&str; 7] = ["host", "state", "actors", "rate", "resent", "round trip", "lag"];
-
-/// What a table says of a host, in the order of [`HOST_COLUMNS`].
-pub(crate) fn host_cells(host: &HostStatus) -> [String; 7] {
-    let state = match host.state {
-        HostState::Connected => "connected".into(),
-        HostState::CutOff => format!("cut off for {:.0} s", host.silent_seconds),
-        HostState::Left => "has left".into(),
-    };
-    let round_trip = host.round_trip_us;
-    [
-        host.name.clone(),
-        state,
-        host.actors.to_string(),
-        format!("{:.0}/s", host.rows_per_second),
-        thousands(host.resent_chunks),
-        round_trip.map_or_else(String::new, |time| format!("{:.1} ms", time as f64 / 1e3)),
-        thousands(host.policy_lag),
-    ]
-}
-
 fn table_of_hosts(hosts: &[HostStatus]) -> Table {
     let mut table = Table::new();
     table.load_style(NOTHING);
@@ -204,25 +155,4 @@ fn table_of_hosts(hosts: &[HostStatus]) -> Table {
         }
     }
     table
-}
-
-/// Which role waits, and for what, in words.
-pub(crate) fn waiting(status: &RunStatus) -> &str {
-    let waiting = status.waiting.as_deref();
-    waiting.map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting))
-}
-
-/// The state of a role in words.
-pub(crate) fn state_name(state: RoleState) -> &'static str {
-    match state {
-        RoleState::Starting => "starting",
-        RoleState::Working => "working",
-        RoleState::WaitingForPeer => "waits for a peer",
-        RoleState::WaitingForRatio => "waits (ratio)",
-        RoleState::Silent => "silent (stopped?)",
-        RoleState::Retiring => "retiring",
-        RoleState::Ending => "ending",
-        RoleState::Restarting => "restarting",
-        RoleState::Done => "done",
-    }
 }

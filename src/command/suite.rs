@@ -9,11 +9,12 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use progress::SuiteProgress;
 use serde::Serialize;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
-use shoal_run::plan::RunOverrides;
+use shoal_run::plan::{RunOverrides, is_configuration_file};
 use shoal_run::records::start::StartRecord;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
@@ -63,7 +64,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     // The suite may be continued from another directory.
     let absolute =
         |path: &Path| std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()));
-    let what = if Path::new(what).extension().is_some_and(|extension| extension == "toml") {
+    let what = if is_configuration_file(Path::new(what)) {
         absolute(Path::new(what))?.display().to_string()
     } else {
         what.to_owned()
@@ -130,7 +131,7 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
         (None, 0) => Ok(ExitCode::SUCCESS),
         (None, failed) => bail!("{failed} of the runs failed; to continue with them: shoal resume {here}"),
         (Some(signal), _) => {
-            let _ = writeln!(std::io::stderr(), "interrupted; to continue: shoal resume {here}");
+            say(format!("interrupted; to continue: shoal resume {here}"));
             Ok(exit_code(signal))
         }
     }
@@ -145,11 +146,8 @@ fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Resul
             .iter()
             .map(|run| RunDir::open(run))
             .collect::<Result<Vec<_>, _>>()?;
-        let mut stderr = std::io::stderr().lock();
-        for line in page::ranking(&runs)? {
-            let _ = writeln!(stderr, "{line}");
-        }
-        let _ = writeln!(stderr, "{here}\n  compare the runs: shoal report {here}");
+        page::ranking(&runs)?.iter().for_each(say);
+        say(format!("{here}\n  compare the runs: shoal report {here}"));
     }
     if output.json {
         let mut runs = Vec::new();
@@ -169,7 +167,7 @@ fn run_json<'a>(suite: &Suite, trial: &'a Trial, path: &Path) -> anyhow::Result<
     let mut json = RunJson {
         run: &trial.name,
         finished: false,
-        ended_early: suite.has_ended(trial),
+        ended_early: suite.was_ended_early(trial),
         env_steps: 0,
         eval_return_mean: None,
     };

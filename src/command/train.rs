@@ -1,11 +1,11 @@
 //! `shoal train`: a new run, from its configuration to its result.
 
-use std::io::Write;
 use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
+use shoal_common::message::say;
 use shoal_run::plan::{Plan, RunOverrides, preset_patterns};
 use shoal_run::suite;
 use shoal_run::usage::UsageError;
@@ -92,14 +92,13 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         warnings,
     } = Plan::new(what, &args.overrides)?;
     for warning in warnings {
-        // A closed standard error is no reason to fail.
-        let _ = writeln!(std::io::stderr(), "warning: {warning}");
+        say(format!("warning: {warning}"));
     }
     if let Some(origin) = origin {
         let line = format!("{} {}", run.name(), origin.in_words());
         launcher::note(&run, &line);
         if !args.output.quiet {
-            let _ = writeln!(std::io::stderr(), "{line}");
+            say(line);
         }
     }
     if args.output.detach {

@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
+use shoal_common::message::{one_line, say};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_env_server::environment::Goal;
 use shoal_learner::process::checkpoint::Checkpoints;
@@ -101,20 +102,18 @@ fn train_and_report(
                 evaluated = policies;
                 let recorded = FinalEvaluation::read(run, env_steps)?.map(|result| record_final(run, &result));
                 if let Err(error) = recorded.transpose() {
-                    say(&format!(
-                        "the final evaluation is not in TensorBoard's records: {error}"
-                    ));
+                    say(format!("the final evaluation is not in TensorBoard's records: {error}"));
                 }
             }
             Err(error) => {
                 lock.check(run)?;
                 let why = match interrupt.signal() {
                     Some(signal) => format!("the final evaluation was ended by {}", describe(signal)),
-                    None => format!("the final evaluation failed: {error:#}").replace('\n', " "),
+                    None => format!("the final evaluation failed: {}", one_line(error)),
                 };
                 let here = run.path().display();
                 launcher::note(run, &why);
-                say(&format!(
+                say(format!(
                     "{why}; the training is finished; to evaluate it: shoal eval {here}"
                 ));
                 finished = finished.with_reason(why);
@@ -128,13 +127,12 @@ fn train_and_report(
     match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt)) {
         Ok(drawn) => {
             if let Some(why) = drawn.no_episode.filter(|_| interrupt.signal().is_none()) {
-                say(&format!("no episode was drawn: {why}"));
+                say(format!("no episode was drawn: {why}"));
             }
         }
         Err(error) => {
             lock.check(run)?;
-            let why = format!("{error:#}").replace('\n', " ");
-            say(&format!("the figures could not be drawn: {why}"));
+            say(format!("the figures could not be drawn: {}", one_line(error)));
         }
     }
     if outcome.ending == RunEnd::Finished {
@@ -156,11 +154,6 @@ fn train_and_report(
         // As a shell reports a process that was ended by the signal.
         RunEnd::Interrupted(signal) => exit_code(signal),
     })
-}
-
-/// Writes a line to standard error. A terminal that is gone, as after `nohup`, must not make the run a failure.
-fn say(line: &str) {
-    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// As [`best_policy::evaluate_and_keep_best`], with a bar for the progress.

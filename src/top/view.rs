@@ -13,7 +13,7 @@ use shoal_common::channel::control::{HostState, RoleState, RoleStatus};
 use shoal_run::numbers::thousands;
 
 use super::{LauncherState, Overlay, Screen};
-use crate::command::status::{HOST_COLUMNS, host_cells, progress, state_name, waiting};
+use crate::status_table::{HOST_COLUMNS, ROLE_COLUMNS, host_cells, progress, role_cells, waiting};
 
 /// Number of rows above the roles, and of rows with keys at the bottom.
 const HEAD: u16 = 4;
@@ -160,34 +160,24 @@ fn draw_roles(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
         0
     };
     let shown = roles.len() - hidden;
-    let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
     let mut rows: Vec<Row<'_>> = roles[..shown]
         .iter()
         .map(|role| {
-            let state = Cell::from(state_name(role.state)).style(style_of(screen, role.state));
-            let mut cells = vec![Cell::from(format!("{} {}", role.role, role.index))];
+            let [name, pid, state, restarts, rate, policy, lag] = role_cells(role);
+            let (name, state) = (Cell::from(name), Cell::from(state).style(style_of(screen, role.state)));
             if wide {
-                cells.push(right(role.pid.map_or_else(String::new, |pid| pid.to_string())));
+                let numbers = [restarts, rate, policy, lag].map(right);
+                Row::new([name, right(pid), state].into_iter().chain(numbers))
+            } else {
+                Row::new([name, state, right(restarts), right(rate)])
             }
-            cells.extend([
-                state,
-                right(role.restarts.to_string()),
-                right(format!("{:.0}/s", role.rate)),
-            ]);
-            if wide {
-                cells.extend([right(or_none(role.policy_version)), right(or_none(role.policy_lag))]);
-            }
-            Row::new(cells)
         })
         .collect();
     if hidden > 0 {
         rows.push(Row::new([Cell::from(format!("and {hidden} more"))]));
     }
     let (names, widths): (&[&str], &[u16]) = if wide {
-        (
-            &["role", "pid", "state", "restarts", "rate", "policy", "lag"],
-            &[13, 8, 17, 8, 8, 8, 5],
-        )
+        (&ROLE_COLUMNS, &[13, 8, 17, 8, 8, 8, 5])
     } else {
         (&["role", "state", "rs", "rate"], &[13, 13, 3, 8])
     };

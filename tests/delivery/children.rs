@@ -11,7 +11,7 @@ use shoal_common::channel::environment::{EnvironmentPort, RequestKind};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier, Services, wait_for};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::stop::Stop;
 use shoal_env_server::server::serve;
@@ -107,10 +107,10 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
     let listener = Listener::bind(domain, EventName(Role::Actor, index)).unwrap();
     let learner = Notifier::new(domain, EventName(Role::Learner, 0)).unwrap();
     let commits = loop {
-        match CommitReader::open(replay) {
-            Err(OpenError::NotYet { .. }) => drop(listener.wait(Duration::from_millis(5)).unwrap()),
-            opened => break opened.unwrap(),
+        if let Some(commits) = CommitReader::open_if_ready(replay).unwrap() {
+            break commits;
         }
+        listener.wait(Duration::from_millis(5)).unwrap();
     };
     let handshake = ChunkSender::open(domain, index, incarnation, chunk_layout(), WINDOW).unwrap();
     reply("ready");

@@ -7,7 +7,7 @@ use std::sync::mpsc::{self, Sender};
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::Domain;
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::stop::Stop;
 use tempfile::TempDir;
 
@@ -80,10 +80,7 @@ impl Run {
     pub(crate) fn commits(&self) -> CommitReader {
         let mut reader = None;
         eventually("a learner creates the replay", || {
-            reader = match CommitReader::open(&self.replay()) {
-                Err(OpenError::NotYet { .. }) => None,
-                opened => Some(opened.unwrap()),
-            };
+            reader = CommitReader::open_if_ready(&self.replay()).unwrap();
             reader.is_some()
         });
         reader.unwrap()

@@ -2,7 +2,8 @@
 
 use proptest::prelude::*;
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
-use shoal_learner::replay::{Replay, are_finite};
+use shoal_common::numbers::are_finite;
+use shoal_learner::replay::Replay;
 
 use crate::support::{Leftovers, QUICK};
 use crate::{SHORT, layout_of, place, server_of};

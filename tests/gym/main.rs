@@ -15,8 +15,9 @@ use std::process::{Command, ExitCode, Stdio};
 use answers::arbitrary_answers_are_survived_or_named_in_one_line;
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
+use shoal_common::numbers::are_finite;
 use shoal_common::space::Space;
-use shoal_learner::replay::{Replay, ReplayLayout, are_finite};
+use shoal_learner::replay::{Replay, ReplayLayout};
 use suite::{PYTHON, test};
 use support::{Leftovers, QUICK, Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
 

@@ -46,7 +46,7 @@ fn a_film_is_written_whole_or_refused_in_one_line() {
     std::fs::write(place.path().join("notes.gif"), "not a film").unwrap();
     for (arguments, part) in [
         (&["--out", "film.avi"][..], ".gif or .mp4"),
-        (&["--out", "notes.gif"], "is no film"),
+        (&["--out", "notes.gif"], "is not a film"),
         (&["--out", "nowhere/at/all.gif"], "cannot write nowhere/at/all.gif"),
         (&["--out", "run"], ".gif or .mp4"),
         (&["--fps", "0"], "0.1 to 1000"),

@@ -10,6 +10,7 @@ use anyhow::{Context, bail};
 use shoal_common::channel::Domain;
 use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reports;
+use shoal_common::commit::CommitReader;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
@@ -18,7 +19,7 @@ use shoal_run::client::RunClient;
 use tempfile::TempDir;
 
 use super::super::measurement::TimeBudget;
-use super::super::progress::{POLL_INTERVAL, newest, open_commits, policy_reader};
+use super::super::progress::{POLL_INTERVAL, newest, policy_reader};
 
 /// How long a learner runs before it is killed, so that the launcher has received its heartbeat.
 const SETTLING_TIME: Duration = Duration::from_millis(700);
@@ -131,7 +132,7 @@ impl Training {
                 seen.insert((heartbeat.role(), heartbeat.index));
             }
             if commits.is_none() {
-                commits = open_commits(&run)?;
+                commits = CommitReader::open_if_ready(&run.replay_file())?;
             }
             let rows = commits.as_ref().map_or(0, |commits| commits.rows());
             let header = newest(&mut observer.policies)?;

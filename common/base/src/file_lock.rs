@@ -1,7 +1,8 @@
 //! Advisory locks on open files. The system releases them when the processes that have the file open end.
 
-use std::fs::{File, TryLockError};
+use std::fs::{File, Metadata, TryLockError};
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -36,6 +37,25 @@ pub fn is_locked(file: &File) -> io::Result<bool> {
     }
 }
 
+/// The ids of the processes that hold a lock on the file with this metadata, as far as the system tells them. Some file
+/// systems show other inodes there.
+pub fn holders(file: &Metadata) -> Vec<i32> {
+    let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
+    locks.lines().filter_map(|line| holder(line, file.ino())).collect()
+}
+
+/// The process that holds the lock in this line of `/proc/locks`, as in `1: FLOCK  ADVISORY  WRITE 4711 08:01:1234 0
+/// EOF`, if it is one on the file with this inode. A process of another PID namespace has the id 0 or -1.
+fn holder(line: &str, inode: u64) -> Option<i32> {
+    let words: Vec<_> = line.split_whitespace().collect();
+    // A process that waits for a lock has an arrow before its kind.
+    let [_, "FLOCK", _, _, pid, file, ..] = words[..] else {
+        return None;
+    };
+    let found: u64 = file.rsplit(':').next()?.parse().ok()?;
+    pid.parse().ok().filter(|pid| *pid > 0 && found == inode)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -48,6 +68,10 @@ mod tests {
         assert!(lock(&first, Duration::ZERO).unwrap());
         assert!(!lock(&open(), Duration::from_millis(5)).unwrap());
         assert!(is_locked(&open()).unwrap());
+        assert_eq!(
+            holders(&directory.path().metadata().unwrap()),
+            [std::process::id() as i32]
+        );
         let second = open();
         thread::scope(|scope| {
             scope.spawn(|| {
@@ -57,6 +81,23 @@ mod tests {
             assert!(lock(&second, Duration::from_secs(60)).unwrap());
         });
         drop(second);
+        assert!(holders(&directory.path().metadata().unwrap()).is_empty());
         assert!(!is_locked(&open()).unwrap());
+    }
+
+    #[test]
+    fn a_line_names_the_holder_of_a_lock() {
+        let line = "1: FLOCK  ADVISORY  WRITE 4711 08:01:1234 0 EOF";
+        assert_eq!(holder(line, 1234), Some(4711));
+        assert_eq!(holder(line, 123), None, "another file");
+        for other in [
+            "1: -> FLOCK  ADVISORY  WRITE 4711 08:01:1234 0 EOF",
+            "1: POSIX  ADVISORY  WRITE 4711 08:01:1234 0 EOF",
+            "1: FLOCK  ADVISORY  WRITE 0 08:01:1234 0 EOF",
+            "1: FLOCK  ADVISORY  WRITE 4711 08:01:1234x 0 EOF",
+            "",
+        ] {
+            assert_eq!(holder(other, 1234), None, "{other}");
+        }
     }
 }

@@ -4,6 +4,8 @@
 pub mod durable;
 pub mod exit;
 pub mod file_lock;
+pub mod message;
+pub mod numbers;
 pub mod packing;
 pub mod report;
 pub mod role;

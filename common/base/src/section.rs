@@ -15,6 +15,8 @@ use std::fmt::Display;
 use serde::de::{DeserializeOwned, Error};
 use toml::{Table, Value};
 
+use crate::message::one_line;
+
 /// Reads the section `name`, whose type is `T`. Every key is optional.
 ///
 /// # Errors
@@ -44,7 +46,7 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
 /// What a value must be, if this is serde's message about a value of another type, which names types of Rust. Otherwise
 /// the message itself, on one line.
 pub fn in_user_words(message: &str) -> String {
-    let message = message.replace('\n', " ");
+    let message = one_line(message);
     let of_type = message.starts_with("invalid type: ") || message.starts_with("invalid value: ");
     let Some((_, expected)) = message.rsplit_once(", expected ").filter(|_| of_type) else {
         return message;
@@ -68,7 +70,7 @@ pub fn refusal(key: impl Display, value: &Value, reason: &str) -> String {
 /// What is wrong with a TOML text, on one line: where the text came from, the number and the text of the line, and the
 /// reason.
 pub fn malformed(origin: impl Display, text: &str, error: &toml::de::Error) -> String {
-    let reason = error.message().replace('\n', " ");
+    let reason = one_line(error.message());
     let Some(start) = error.span().map(|span| span.start.min(text.len())) else {
         return format!("{origin}: {reason}");
     };

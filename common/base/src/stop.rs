@@ -69,12 +69,14 @@ impl Stop {
     }
 }
 
-/// Kills this process, together with its process group if it leads one.
-fn kill_this_group() {
+/// Kills this process, together with its process group if it leads one. Does not return.
+pub fn kill_this_group() -> ! {
     // This cannot fail: the process exists and belongs to the same user.
     let _ = if getpgrp() == getpid() {
         kill_process_group(getpgrp(), Signal::KILL)
     } else {
         kill_process(getpid(), Signal::KILL)
     };
+    // The signal has ended this process before the call returns.
+    std::process::abort()
 }

@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::durable::write_atomically;
+use crate::message::one_line;
 
 /// How the text of a file is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -152,7 +153,7 @@ fn decode<F: VersionedFile, T: DeserializeOwned>(path: &str, text: &[u8]) -> Res
         Encoding::Json => serde_json::from_slice(text).map_err(|error| error.to_string()),
         Encoding::Toml => std::str::from_utf8(text)
             .map_err(|error| error.to_string())
-            .and_then(|text| toml::from_str(text).map_err(|error| error.message().replace('\n', " "))),
+            .and_then(|text| toml::from_str(text).map_err(|error| one_line(error.message()))),
     };
     decoded.map_err(|cause| VersionedFileError::Damaged {
         path: path.into(),

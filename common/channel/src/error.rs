@@ -64,7 +64,7 @@ impl ChannelError {
             | ChannelErrorKind::Corrupted
             | ChannelErrorKind::Exhausted
             | ChannelErrorKind::Unreachable
-            | ChannelErrorKind::ChildProcess
+            | ChannelErrorKind::Peer
             | ChannelErrorKind::Internal => false,
         }
     }
@@ -102,7 +102,7 @@ pub enum ChannelErrorKind {
     Unreachable,
     /// The other side violates the protocol.
     #[error("the other side violates the protocol")]
-    ChildProcess,
+    Peer,
     /// Anything else.
     #[error("an unexpected failure; is /dev/shm mounted and not full?")]
     Internal,
@@ -151,7 +151,7 @@ pub enum PeerError {
 /// the text of the kind comes first.
 fn reason(kind: ChannelErrorKind, source: &(dyn Error + Send + Sync)) -> String {
     match kind {
-        ChannelErrorKind::ChildProcess => source.to_string(),
+        ChannelErrorKind::Peer => source.to_string(),
         _ => format!("{kind} ({source})"),
     }
 }
@@ -163,7 +163,7 @@ pub(super) trait Cause: Error + Send + Sync + 'static {
 
 impl Cause for PeerError {
     fn kind(&self) -> ChannelErrorKind {
-        ChannelErrorKind::ChildProcess
+        ChannelErrorKind::Peer
     }
 }
 

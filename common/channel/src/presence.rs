@@ -9,6 +9,8 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use shoal_base::file_lock;
+
 use super::files::{SHARED_MEMORY, prefix};
 
 /// The end of the file's name.
@@ -81,17 +83,7 @@ pub(super) fn members(run_id: &str) -> Vec<i32> {
     let Ok(metadata) = path(run_id).symlink_metadata() else {
         return Vec::new();
     };
-    let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
-    // A line: 1: FLOCK ADVISORY READ 4711 00:1a:99 0 EOF, with the process and the file's number.
-    let holder = |line: &str| {
-        let words: Vec<_> = line.split_whitespace().collect();
-        let [_, "FLOCK", _, _, pid, file, ..] = words[..] else {
-            return None;
-        };
-        let inode: u64 = file.rsplit(':').next()?.parse().ok()?;
-        pid.parse().ok().filter(|pid| *pid > 0 && inode == metadata.ino())
-    };
-    locks.lines().filter_map(holder).collect()
+    file_lock::holders(&metadata)
 }
 
 /// The runs of this user that have such a file.

@@ -31,29 +31,21 @@ pub enum PolicyLayout {
     },
 }
 
-/// Why an algorithm cannot control an environment.
+/// Why an algorithm, which the text calls "it", cannot control an environment.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PolicyError {
     /// A policy with tanh outputs needs real-valued actions.
     #[error(transparent)]
     Action(#[from] ActionRangeError),
     /// A score for every action needs discrete actions.
-    #[error("{algorithm} needs a discrete action space, but these actions are real-valued (a box)")]
-    DiscreteActionsRequired {
-        /// The algorithm.
-        algorithm: &'static str,
-    },
+    #[error("it needs a discrete action space, but these actions are real-valued (a box)")]
+    DiscreteActionsRequired,
     /// A table needs discrete observations.
-    #[error("{algorithm} needs a discrete observation space, but these observations are real-valued (a box)")]
-    DiscreteStatesRequired {
-        /// The algorithm.
-        algorithm: &'static str,
-    },
+    #[error("it needs a discrete observation space, but these observations are real-valued (a box)")]
+    DiscreteStatesRequired,
     /// A network needs real-valued observations: it would use an index as a quantity.
-    #[error("{algorithm} needs real-valued observations (a box), but these are indices of {n} states")]
+    #[error("it needs real-valued observations (a box), but these are indices of {n} states")]
     RealStatesRequired {
-        /// The algorithm.
-        algorithm: &'static str,
         /// Number of states.
         n: u32,
     },
@@ -170,51 +162,38 @@ pub fn deterministic(
 }
 
 /// A squashed Gaussian policy with this network in an environment like `spec`, for at most `batch` observations a call.
-/// `algorithm` is named in errors.
 ///
 /// # Errors
 /// When the observations are not real numbers, or the actions are not real numbers in finite ranges.
-pub fn gaussian(
-    algorithm: &'static str,
-    network: NetworkLayout,
-    spec: &EnvironmentSpec,
-    batch: usize,
-) -> Result<GaussianPolicy, PolicyError> {
+pub fn gaussian(network: NetworkLayout, spec: &EnvironmentSpec, batch: usize) -> Result<GaussianPolicy, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
-    check_real_observations(algorithm, spec)?;
+    check_real_observations(spec)?;
     Ok(GaussianPolicy::new(network, range, batch))
 }
 
 /// A softmax policy with this network in an environment like `spec`, for at most `batch` observations a call.
-/// `algorithm` is named in errors.
 ///
 /// # Errors
 /// When the actions are not discrete, or the observations are not real numbers.
-pub fn softmax(
-    algorithm: &'static str,
-    network: NetworkLayout,
-    spec: &EnvironmentSpec,
-    batch: usize,
-) -> Result<Scores, PolicyError> {
-    counted_actions(algorithm, spec)?;
-    check_real_observations(algorithm, spec)?;
+pub fn softmax(network: NetworkLayout, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
+    counted_actions(spec)?;
+    check_real_observations(spec)?;
     Ok(Scores::softmax(network, batch))
 }
 
 /// Action-values that this network computes, as dueling heads or directly, in an environment like `spec`, for at most
-/// `batch` observations a call. `algorithm` is named in errors.
+/// `batch` observations a call.
 ///
 /// # Errors
 /// When the actions are not discrete, or the observations are not real numbers.
 pub fn action_values(
-    algorithm: &'static str,
     network: NetworkLayout,
     dueling: bool,
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
-    counted_actions(algorithm, spec)?;
-    check_real_observations(algorithm, spec)?;
+    counted_actions(spec)?;
+    check_real_observations(spec)?;
     Ok(if dueling {
         Scores::dueling(network, batch)
     } else {
@@ -222,34 +201,33 @@ pub fn action_values(
     })
 }
 
-/// Checks that the observations are real numbers. `algorithm` is named in the error.
+/// Checks that the observations are real numbers.
 ///
 /// # Errors
 /// When they are indices.
-pub fn check_real_observations(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(), PolicyError> {
+pub fn check_real_observations(spec: &EnvironmentSpec) -> Result<(), PolicyError> {
     match spec.observation {
-        Space::Discrete { n, .. } => Err(PolicyError::RealStatesRequired { algorithm, n }),
+        Space::Discrete { n, .. } => Err(PolicyError::RealStatesRequired { n }),
         Space::Box { .. } => Ok(()),
     }
 }
 
-/// A table of action-values in an environment like `spec`, for at most `batch` observations a call. `algorithm` is
-/// named in errors.
+/// A table of action-values in an environment like `spec`, for at most `batch` observations a call.
 ///
 /// # Errors
 /// When observations or actions are not discrete.
-pub fn table(algorithm: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
-    let actions = counted_actions(algorithm, spec)?;
+pub fn table(spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
+    let actions = counted_actions(spec)?;
     match spec.observation {
         Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
-        Space::Box { .. } => Err(PolicyError::DiscreteStatesRequired { algorithm }),
+        Space::Box { .. } => Err(PolicyError::DiscreteStatesRequired),
     }
 }
 
-fn counted_actions(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
+fn counted_actions(spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.action {
         Space::Discrete { n, .. } => Ok(n as usize),
-        Space::Box { .. } => Err(PolicyError::DiscreteActionsRequired { algorithm }),
+        Space::Box { .. } => Err(PolicyError::DiscreteActionsRequired),
     }
 }
 
@@ -281,7 +259,7 @@ mod tests {
     #[test]
     fn a_table_is_read_state_after_state_and_the_first_of_equal_actions_is_taken() {
         let lake = spec(Space::discrete(3), Space::discrete(2));
-        let mut policy = Policy::Scored(table("q-learning", &lake, 4).unwrap());
+        let mut policy = Policy::Scored(table(&lake, 4).unwrap());
         assert_eq!(policy.layout().parameters(), 6);
         let mut actions = [f32::NAN; 4];
         policy.act(&[0.0, 1.0, 0.5, 0.5, 2.0, 1.0], &[0.0, 1.0, 2.0, 0.0], &mut actions);

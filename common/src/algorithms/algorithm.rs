@@ -37,11 +37,11 @@ pub enum TransitionUse {
 /// the environment has them; `Config` adds their normalisation.
 pub trait AlgorithmSettings {
     /// Its policy in an environment like `spec`, for at most `envs` observations a call, and how actors explore with
-    /// it. `name` is the name of the algorithm.
+    /// it.
     ///
     /// # Errors
     /// When it cannot control that environment.
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError>;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError>;
 
     /// The networks or tables that it learns in an environment like `spec`.
     fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes;

@@ -60,7 +60,7 @@ impl DdpgConfig {
 }
 
 impl AlgorithmSettings for DdpgConfig {
-    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
         let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, envs)?;
         Ok(Behaviour::Noise(policy, self.exploration.clone()))
     }

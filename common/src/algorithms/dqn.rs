@@ -67,8 +67,8 @@ impl DqnConfig {
 }
 
 impl AlgorithmSettings for DqnConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        let values = shoal_policy::action_values(name, self.network(spec), self.dueling, spec, envs)?;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let values = shoal_policy::action_values(self.network(spec), self.dueling, spec, envs)?;
         let epsilon = Epsilon {
             start: self.epsilon_start,
             end: self.epsilon_end,

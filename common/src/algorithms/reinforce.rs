@@ -84,8 +84,8 @@ impl ReinforceConfig {
 }
 
 impl AlgorithmSettings for ReinforceConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::softmax(name, self.networks(spec).policy, spec, envs)?;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::softmax(self.networks(spec).policy, spec, envs)?;
         Ok(Behaviour::Sample(policy))
     }
 

@@ -65,8 +65,8 @@ impl SacConfig {
 }
 
 impl AlgorithmSettings for SacConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::gaussian(name, self.networks(spec).actor, spec, envs)?;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::gaussian(self.networks(spec).actor, spec, envs)?;
         Ok(Behaviour::Gaussian(policy))
     }
 

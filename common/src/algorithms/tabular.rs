@@ -39,8 +39,8 @@ section! {
 }
 
 impl AlgorithmSettings for TabularConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        let values = shoal_policy::table(name, spec, envs)?;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let values = shoal_policy::table(spec, envs)?;
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 

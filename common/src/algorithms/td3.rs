@@ -69,8 +69,8 @@ impl Td3Config {
 }
 
 impl AlgorithmSettings for Td3Config {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
-        shoal_policy::check_real_observations(name, spec)?;
+    fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        shoal_policy::check_real_observations(spec)?;
         let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, envs)?;
         // With θ = 1 the noise of a step does not depend on the previous one: it is N(0, σ²).
         let noise = ExplorationConfig {

@@ -17,15 +17,15 @@ section! {
             change: in_free_runs("the length of a round depends on it");
         /// Chunks that an actor may have sent and the learner has not committed yet.
         window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
-        /// The most actors that the run can be scaled to.
-        max: u32 = 16, bounds: from(1, ActorsConfig::GREATEST_MAX), unit: "processes", source: "ours",
+        /// The most actors that the run can be scaled to, on all hosts together.
+        max: u32 = 16, bounds: from(1, ActorsConfig::MAX_ACTORS), unit: "processes", source: "ours",
             change: never("the replay has a place for each of them");
     }
 }
 
 impl ActorsConfig {
     /// The upper bound of `max`.
-    pub const GREATEST_MAX: u32 = 256;
+    pub const MAX_ACTORS: u32 = 256;
 
     /// Checks every number.
     ///

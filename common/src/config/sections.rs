@@ -1,6 +1,7 @@
 //! The sections of the configuration's text. At most one of the algorithms' sections may be present.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use shoal_base::message::one_line;
 use shoal_base::space::EnvironmentSpec;
 use toml::Table;
 
@@ -117,7 +118,7 @@ pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
     explanation::sections().into_iter().find_map(|section| {
         let name = section.name;
         let error = (section.check)(name, sections.get(name)?.clone()).err()?;
-        let message = error.message().replace('\n', " ");
+        let message = one_line(error.message());
         let is_named = message.starts_with(&format!("{name}."));
         Some(if is_named {
             message

@@ -50,7 +50,7 @@ impl Dqn {
     pub fn new(spec: &EnvironmentSpec, settings: &config::DqnConfig, seed: u64) -> Result<Self, PolicyError> {
         let batch = settings.batch;
         let layout = settings.network(spec);
-        policy::action_values("dqn", layout, settings.dueling, spec, 0)?;
+        policy::action_values(layout, settings.dueling, spec, 0)?;
         Ok(Self {
             threads: Threads::ALONE,
             updates: 0,

@@ -5,19 +5,20 @@ use shoal_common::policy::PolicyError;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, RunSizes, SavedState, StateArrayError};
 use super::normaliser::{self, Normaliser};
-use super::tabular;
+use super::tabular::{Bootstrap, TabularDefinition};
 use crate::networks::product::Products;
 
 /// The definition of the algorithm with these settings.
 fn definition(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmDefinition + '_> {
+    let tabular = |bootstrap, settings| Box::new(TabularDefinition { bootstrap, settings });
     match algorithm {
         config::AlgorithmConfig::Ddpg(settings) => Box::new(settings),
         config::AlgorithmConfig::Td3(settings) => Box::new(settings),
         config::AlgorithmConfig::Sac(settings) => Box::new(settings),
         config::AlgorithmConfig::Dqn(settings) => Box::new(settings),
         config::AlgorithmConfig::Reinforce(settings) => Box::new(settings),
-        config::AlgorithmConfig::QLearning(settings) => Box::new(tabular::QLearning(settings)),
-        config::AlgorithmConfig::Sarsa(settings) => Box::new(tabular::Sarsa(settings)),
+        config::AlgorithmConfig::QLearning(settings) => tabular(Bootstrap::Max, settings),
+        config::AlgorithmConfig::Sarsa(settings) => tabular(Bootstrap::NextAction, settings),
     }
 }
 

@@ -13,48 +13,41 @@ use nalgebra::DMatrix;
 use shoal_common::algorithms::{AlgorithmSettings, ReinforceNetworks};
 use shoal_common::config::{self, Config, ReturnWeighting};
 use shoal_common::network::NetworkLayout;
+use shoal_common::numbers::are_finite;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, SavedState, StateArray, StateArrayError};
-use crate::networks::adam::Adam;
-use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
 use crate::networks::pass::Pass;
 use crate::networks::threads::Threads;
-use crate::replay::{Replay, are_finite};
+use crate::networks::trainable::TrainableNetwork;
+use crate::replay::Replay;
 
 /// Added to a standard deviation before dividing by it. An episode whose returns are all equal then has no weight.
 const SPREAD_FLOOR: f32 = 1e-8;
 
-/// A network without a target network, and the state of its optimiser.
+/// A network that learns, with its pass over the steps of a round.
 #[derive(Clone, Debug)]
-struct TrainableNetworkWithPass {
-    layout: NetworkLayout,
-    parameters: Aligned,
-    gradient: Aligned,
-    adam: Adam,
+struct NetworkWithPass {
+    network: TrainableNetwork,
     pass: Pass,
     /// ∂L/∂output
     d: DMatrix<f32>,
 }
 
-impl TrainableNetworkWithPass {
+impl NetworkWithPass {
     fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64, steps: usize) -> Self {
-        let parameters = glorot(&layout, seed, index);
         Self {
-            layout,
-            gradient: Aligned::zeros(parameters.len(), 2),
-            adam: Adam::new(learning_rate, parameters.len()),
-            parameters: Aligned::from_slice(&parameters, 0),
+            network: TrainableNetwork::new(layout, learning_rate, &glorot(&layout, seed, index)),
             pass: Pass::new(layout, steps),
             d: DMatrix::zeros(layout.outputs(), steps),
         }
     }
 
     fn forward(&mut self, s: &DMatrix<f32>) {
-        self.pass.forward(&self.parameters, s.as_slice(), &[]);
+        self.pass.forward(&self.network.parameters, s.as_slice(), &[]);
     }
 
     /// Takes one step of Adam against the gradient that follows from the first `steps` columns of `d` and the forward
@@ -63,12 +56,12 @@ impl TrainableNetworkWithPass {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
         self.pass.backward(
             &Threads::ALONE,
-            &self.parameters,
+            &self.network.parameters,
             s.as_slice(),
             &self.d,
-            &mut self.gradient,
+            &mut self.network.gradient,
         );
-        self.adam.step(&Threads::ALONE, t, &self.gradient, &mut self.parameters);
+        self.network.descend(&Threads::ALONE, t);
     }
 }
 
@@ -76,8 +69,8 @@ impl TrainableNetworkWithPass {
 #[derive(Clone, Debug)]
 pub struct Reinforce {
     settings: config::ReinforceConfig,
-    policy: TrainableNetworkWithPass,
-    baseline: Option<TrainableNetworkWithPass>,
+    policy: NetworkWithPass,
+    baseline: Option<NetworkWithPass>,
     /// Rows learned from.
     rows: u64,
     /// Steps taken by Adam, as stored in a checkpoint. The `f32` is exact up to 2²⁴, more episodes than any run has.
@@ -106,12 +99,12 @@ impl Reinforce {
         sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
         let ReinforceNetworks { policy, baseline } = settings.networks(spec);
-        policy::softmax("reinforce", policy, spec, 0)?;
+        policy::softmax(policy, spec, 0)?;
         let steps = sizes.chunk_rows * sizes.actors as usize;
         Ok(Self {
-            policy: TrainableNetworkWithPass::new(policy, settings.learning_rate, seed, 0, steps),
+            policy: NetworkWithPass::new(policy, settings.learning_rate, seed, 0, steps),
             baseline: baseline
-                .map(|network| TrainableNetworkWithPass::new(network, settings.baseline_learning_rate, seed, 1, steps)),
+                .map(|network| NetworkWithPass::new(network, settings.baseline_learning_rate, seed, 1, steps)),
             settings: settings.clone(),
             rows: 0,
             steps: [0.0],
@@ -191,7 +184,7 @@ impl Reinforce {
             && episode.iter().all(is_finite)
     }
 
-    fn networks(&self) -> impl Iterator<Item = &TrainableNetworkWithPass> {
+    fn networks(&self) -> impl Iterator<Item = &NetworkWithPass> {
         std::iter::once(&self.policy).chain(&self.baseline)
     }
 }
@@ -241,11 +234,11 @@ impl AlgorithmDefinition for &config::ReinforceConfig {
 
 impl Algorithm for Reinforce {
     fn policy(&self) -> Cow<'_, [f32]> {
-        Cow::Borrowed(&self.policy.parameters)
+        Cow::Borrowed(&self.policy.network.parameters)
     }
 
     fn layout(&self) -> PolicyLayout {
-        PolicyLayout::Softmax(self.policy.layout)
+        PolicyLayout::Softmax(self.policy.network.layout)
     }
 
     fn updates(&self) -> u64 {
@@ -261,23 +254,23 @@ impl Algorithm for Reinforce {
 
     fn state(&self) -> Vec<StateArray<'_>> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
-        let networks = self
-            .networks()
-            .zip(names)
-            .flat_map(|(network, (name, [first, second]))| {
-                [
-                    (name, &*network.parameters),
-                    (first, &*network.adam.first_moment),
-                    (second, &*network.adam.second_moment),
-                ]
-            });
+        let networks =
+            self.networks()
+                .zip(names)
+                .flat_map(|(NetworkWithPass { network, .. }, (name, [first, second]))| {
+                    [
+                        (name, &*network.parameters),
+                        (first, &*network.adam.first_moment),
+                        (second, &*network.adam.second_moment),
+                    ]
+                });
         networks.chain([(Self::STEPS, self.steps.as_slice())]).collect()
     }
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
-        for (network, (name, [first, second])) in std::iter::once(&mut self.policy).chain(&mut self.baseline).zip(names)
-        {
+        let networks = std::iter::once(&mut self.policy).chain(&mut self.baseline);
+        for (NetworkWithPass { network, .. }, (name, [first, second])) in networks.zip(names) {
             for (numbers, name) in [
                 (&mut network.parameters, name),
                 (&mut network.adam.first_moment, first),

@@ -4,51 +4,38 @@ use std::borrow::Cow;
 
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config::{self, Config};
+use shoal_common::numbers::are_finite;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, SavedState, StateArray, StateArrayError};
-use crate::replay::{Replay, are_finite};
+use crate::replay::Replay;
 
 /// Which value of s' an update bootstraps from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bootstrap {
-    /// max Q(s', ·): equation 3.13.
+    /// max Q(s', ·), which is Q-learning: equation 3.13.
     Max,
-    /// Q(s', a') with the action a' that was taken there: equation 3.12.
+    /// Q(s', a') with the action a' that was taken there, which is SARSA: equation 3.12.
     NextAction,
 }
 
-/// Q-learning with these settings.
+/// How a table learns with these settings.
 #[derive(Debug)]
-pub struct QLearning<'a>(pub &'a config::TabularConfig);
-
-/// SARSA with these settings.
-#[derive(Debug)]
-pub struct Sarsa<'a>(pub &'a config::TabularConfig);
-
-impl AlgorithmDefinition for QLearning<'_> {
-    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-        let sizes = RunSizes::from(config);
-        Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, &config.spec, sizes)?))
-    }
-
-    fn weights(&self) -> &'static [&'static str] {
-        &Tabular::WEIGHTS
-    }
-
-    fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-        state_numbers(self.0, spec, sizes)
-    }
+pub struct TabularDefinition<'a> {
+    /// The algorithm.
+    pub bootstrap: Bootstrap,
+    /// Its settings.
+    pub settings: &'a config::TabularConfig,
 }
 
-impl AlgorithmDefinition for Sarsa<'_> {
+impl AlgorithmDefinition for TabularDefinition<'_> {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sizes = RunSizes::from(config);
         Ok(Box::new(Tabular::new(
-            Bootstrap::NextAction,
-            self.0,
+            self.bootstrap,
+            self.settings,
             &config.spec,
             sizes,
         )?))
@@ -58,14 +45,10 @@ impl AlgorithmDefinition for Sarsa<'_> {
         &Tabular::WEIGHTS
     }
 
+    /// The table, and a pending step for each environment.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-        state_numbers(self.0, spec, sizes)
+        self.settings.learned(spec).parameters() + slots(sizes) * PENDING
     }
-}
-
-/// The table, and a pending step for each environment.
-fn state_numbers(settings: &config::TabularConfig, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-    settings.learned(spec).parameters() + slots(sizes) * PENDING
 }
 
 /// The number of environments of all actors.
@@ -116,11 +99,7 @@ impl Tabular {
         spec: &EnvironmentSpec,
         sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
-        let name = match bootstrap {
-            Bootstrap::Max => "q-learning",
-            Bootstrap::NextAction => "sarsa",
-        };
-        let scores = policy::table(name, spec, 0)?;
+        let scores = policy::table(spec, 0)?;
         Ok(Self {
             bootstrap,
             alpha: settings.alpha as f32,

@@ -2,10 +2,11 @@
 
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
+use shoal_common::numbers::are_finite;
 use shoal_common::role::Role;
 use shoal_common::transition::ChunkLayout;
 
-use crate::replay::{Appended, ChunkError, Replay, are_finite};
+use crate::replay::{Appended, ChunkError, Replay};
 
 /// Why a chunk was not appended.
 #[derive(Debug, thiserror::Error)]

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, compiler_fence};
 
 use shoal_common::commit::{ActorCommit, CommitRecord, FileOffsets, ReplayLayout, WritableWords};
+use shoal_common::numbers::are_finite;
 
 use super::error::ReplayError;
 use super::ring::Ring;
@@ -31,12 +32,6 @@ pub struct Replay {
     pub(super) hook: Option<Hook>,
     /// Whether it has been logged that some rows are not learned from.
     warned: AtomicBool,
-}
-
-/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector
-/// instructions.
-pub fn are_finite(numbers: &[f32]) -> bool {
-    numbers.iter().fold(true, |all, number| all & number.is_finite())
 }
 
 impl Replay {

@@ -137,6 +137,7 @@ fn a_replay_is_created_once_and_has_one_writer() {
     let path = directory.replay();
     assert!(matches!(Replay::open(&path, &layout(10)), Err(ReplayError::Missing(_))));
     assert!(matches!(CommitReader::open(&path), Err(OpenError::NotYet { .. })));
+    assert!(CommitReader::open_if_ready(&path).unwrap().is_none());
     // Left by a learner that was killed while it created the file.
     fs::write(path.with_extension("rows.new"), "half").unwrap();
     let replay = Replay::create(&path, &layout(10)).unwrap();

@@ -36,7 +36,7 @@ pub(super) enum SeriesStyle {
     Crosses,
 }
 
-/// A series of points. Those beyond [`LARGEST`] or not finite are left out.
+/// A series of points. Those beyond [`MAX_COORDINATE`] or not finite are left out.
 pub(super) struct Series<'a> {
     /// Its name in the legend; empty if it has no entry.
     pub(super) label: &'a str,
@@ -124,7 +124,7 @@ impl Panel<'_> {
                 .points
                 .iter()
                 .copied()
-                .filter(|(x, y)| x.abs() <= LARGEST && y.abs() <= LARGEST);
+                .filter(|(x, y)| x.abs() <= MAX_COORDINATE && y.abs() <= MAX_COORDINATE);
             let line = stroke(series.color, series.opacity, series.width);
             match series.style {
                 SeriesStyle::Line => chart.draw_series(LineSeries::new(finite, line))?,
@@ -207,12 +207,12 @@ impl Ticks {
 }
 
 /// Points with larger coordinates are not drawn: the distance between ticks could not be computed.
-const LARGEST: f64 = 1e30;
+const MAX_COORDINATE: f64 = 1e30;
 
 /// A range that contains all drawable `values`, with a margin on both sides. It is never so narrow that consecutive
 /// ticks would be the same number: plotters would then search for the next tick forever.
 pub(super) fn range_of(values: impl Iterator<Item = f64>) -> Range<f64> {
-    let drawn = values.filter(|value| value.abs() <= LARGEST);
+    let drawn = values.filter(|value| value.abs() <= MAX_COORDINATE);
     let (low, high) = drawn.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
         (low.min(v), high.max(v))
     });

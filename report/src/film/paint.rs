@@ -5,7 +5,7 @@ use shoal_env_server::frame::Image;
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Rect, Stroke, Transform};
 
 /// A picture is at most this many times as wide as high, or as high as wide.
-const LONGEST: f64 = 4.0;
+const MAX_ASPECT_RATIO: f64 = 4.0;
 
 /// The colours of the report's light page.
 const PAPER: [u8; 3] = [255, 255, 255];
@@ -77,7 +77,7 @@ impl Painter {
         if !(wide.is_finite() && high.is_finite() && wide > 0.0 && high > 0.0) {
             return None;
         }
-        let (wide, high) = (wide.max(high / LONGEST), high.max(wide / LONGEST));
+        let (wide, high) = (wide.max(high / MAX_ASPECT_RATIO), high.max(wide / MAX_ASPECT_RATIO));
         let most = f64::from(self.height);
         let scale = (most / high).min(2.0 * most / wide);
         let pixels = |length: f64| ((length * scale).round() as u32).max(1);

@@ -88,7 +88,7 @@ impl Played {
         let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;
         let (mut no_pictures, mut pace) = (None, None);
         if is_external && limits.pictured > 0 {
-            rollout = rollout.seen(pictures::HEIGHT);
+            rollout = rollout.with_pictures(pictures::HEIGHT);
         } else if is_external {
             no_pictures = Some("A report of this many runs has no space for this run's pictures.".into());
         }

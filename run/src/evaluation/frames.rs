@@ -15,7 +15,7 @@ pub struct Frames {
 
 /// Collects the pictures of an episode as it is played. A long episode is thinned out: whenever there are more than
 /// `most`, every second one is dropped.
-pub(super) struct Recorder {
+pub(super) struct FrameCollector {
     most: usize,
     stride: usize,
     frames: Vec<Frame>,
@@ -23,7 +23,7 @@ pub(super) struct Recorder {
     why_not: Option<String>,
 }
 
-impl Recorder {
+impl FrameCollector {
     /// At most `most` pictures, but at least two, of every state or of every `stride`th.
     pub(super) fn new(most: usize, stride: usize) -> Self {
         Self {
@@ -105,14 +105,14 @@ mod tests {
     #[test]
     fn a_long_episode_is_thinned_out_evenly() {
         for (steps, most, stride) in [(4, 10, 1), (9, 10, 1), (10, 10, 2), (100, 10, 16), (1000, 7, 256)] {
-            let mut recorder = Recorder::new(most, 1);
+            let mut collector = FrameCollector::new(most, 1);
             for step in 0..=steps {
-                if recorder.wants(step) {
+                if collector.wants(step) {
                     let frame = Ok(picture(step));
-                    recorder.add(Some(Written { frame, fps: Some(20.0) }));
+                    collector.add(Some(Written { frame, fps: Some(20.0) }));
                 }
             }
-            let frames = recorder.finish().unwrap();
+            let frames = collector.finish().unwrap();
             let expected: Vec<Frame> = (0..=steps).step_by(stride).map(picture).collect();
             assert_eq!((frames.stride, frames.frames), (stride, expected), "{steps} steps");
             assert_eq!(frames.fps, Some(20.0));
@@ -121,12 +121,12 @@ mod tests {
 
     #[test]
     fn a_reason_ends_the_recording() {
-        let mut recorder = Recorder::new(5, 1);
+        let mut collector = FrameCollector::new(5, 1);
         let frame = Err("no pygame".to_owned());
-        recorder.add(Some(Written { frame, fps: None }));
-        assert!(!recorder.wants(1));
-        assert_eq!(recorder.finish(), Err("no pygame".into()));
-        let mut silent = Recorder::new(5, 1);
+        collector.add(Some(Written { frame, fps: None }));
+        assert!(!collector.wants(1));
+        assert_eq!(collector.finish(), Err("no pygame".into()));
+        let mut silent = FrameCollector::new(5, 1);
         silent.add(None);
         assert!(silent.finish().unwrap_err().contains("no pictures"));
     }

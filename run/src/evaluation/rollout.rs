@@ -12,7 +12,7 @@ use shoal_env_server::environment::angle::unwrapped;
 use shoal_env_server::frame::{Frame, Written};
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 
-use crate::evaluation::frames::{Frames, Recorder};
+use crate::evaluation::frames::{FrameCollector, Frames};
 use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::ServerSurroundings;
 use crate::signals::{Interrupt, describe};
@@ -116,12 +116,12 @@ impl<'a> Rollout<'a> {
     }
 
     /// After a signal, episodes end with an error.
-    pub fn until(self, interrupt: Interrupt) -> Self {
+    pub fn interruptible_by(self, interrupt: Interrupt) -> Self {
         Self { interrupt, ..self }
     }
 
     /// Asks an environment that another program serves for pictures, at most this many pixels high.
-    pub fn seen(mut self, height: u32) -> Self {
+    pub fn with_pictures(mut self, height: u32) -> Self {
         self.surroundings.picture_height = Some(height);
         self
     }
@@ -165,8 +165,8 @@ impl<'a> Rollout<'a> {
     ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
         let mut tries = 1;
         loop {
-            let mut recorder = frames.map(|(most, stride)| Recorder::new(most, stride));
-            match self.try_episode(reset, progress, &mut recorder) {
+            let mut collector = frames.map(|(most, stride)| FrameCollector::new(most, stride));
+            match self.try_episode(reset, progress, &mut collector) {
                 Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.environment.can_be_restarted() => {
                     tries += 1;
                 }
@@ -174,7 +174,7 @@ impl<'a> Rollout<'a> {
                 Err(error) => return Err(error),
                 Ok(trajectory) => {
                     let nothing = || Err("no pictures were asked for".into());
-                    return Ok((trajectory, recorder.map_or_else(nothing, Recorder::finish)));
+                    return Ok((trajectory, collector.map_or_else(nothing, FrameCollector::finish)));
                 }
             }
         }
@@ -184,7 +184,7 @@ impl<'a> Rollout<'a> {
         &mut self,
         reset: Reset<'_>,
         progress: &mut dyn FnMut(usize),
-        recorder: &mut Option<Recorder>,
+        collector: &mut Option<FrameCollector>,
     ) -> anyhow::Result<Trajectory> {
         self.environment.ask_for_picture()?;
         let mut observation = self
@@ -201,11 +201,11 @@ impl<'a> Rollout<'a> {
             }
             progress(steps);
             self.policy.act(self.parameters, &observation, &mut action);
-            if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.wants(steps)) {
-                recorder.add(self.environment.see(&action)?);
+            if let Some(collector) = collector.as_mut().filter(|collector| collector.wants(steps)) {
+                collector.add(self.environment.see(&action)?);
             }
             let last = steps + 1 == self.config.spec.time_limit as usize;
-            let wants_next = recorder.as_ref().is_some_and(|it| last || it.wants(steps + 1));
+            let wants_next = collector.as_ref().is_some_and(|it| last || it.wants(steps + 1));
             if wants_next {
                 self.environment.ask_for_picture()?;
             }
@@ -215,8 +215,8 @@ impl<'a> Rollout<'a> {
             trajectory.actions.push(action.clone());
             trajectory.rewards.push(step.reward);
             if step.terminated || step.truncated {
-                if let (Some(recorder), true) = (recorder, wants_next || self.environment.is_builtin()) {
-                    recorder.add_last(self.environment.see(&[])?.and_then(|written| written.frame.ok()));
+                if let (Some(collector), true) = (collector, wants_next || self.environment.is_builtin()) {
+                    collector.add_last(self.environment.see(&[])?.and_then(|written| written.frame.ok()));
                 }
                 trajectory.terminated = step.terminated;
                 break;

@@ -14,7 +14,7 @@ use toml::{Table, Value};
 use super::source::{SettingSource, SettingSources};
 use super::table::put;
 use crate::external_environment::GYMNASIUM;
-use crate::numbers::{count, small_count};
+use crate::numbers::{parse_count, parse_small_count};
 use crate::plan::algorithm;
 use crate::usage::UsageError;
 
@@ -28,19 +28,19 @@ pub struct RunOverrides {
     #[arg(long = "method", visible_alias = "algorithm", value_name = "ALGORITHM", value_parser = PossibleValuesParser::new(algorithm::names()))]
     pub algorithm: Option<String>,
     /// Seed of every random stream.
-    #[arg(long, value_parser = count)]
+    #[arg(long, value_parser = parse_count)]
     pub seed: Option<u64>,
     /// Actor processes.
-    #[arg(long, value_name = "N", value_parser = small_count)]
+    #[arg(long, value_name = "N", value_parser = parse_small_count)]
     pub actors: Option<u32>,
     /// Environments of each actor.
-    #[arg(long, value_name = "E", value_parser = small_count)]
+    #[arg(long, value_name = "E", value_parser = parse_small_count)]
     pub envs: Option<u32>,
     /// Environment steps of all actors together.
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     pub steps: Option<u64>,
     /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
-    #[arg(long, value_name = "M", value_parser = count)]
+    #[arg(long, value_name = "M", value_parser = parse_count)]
     pub episodes: Option<u64>,
     /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
     #[arg(long)]
@@ -240,7 +240,7 @@ pub(super) fn read_counts(table: &mut Table) -> Result<(), UsageError> {
             Value::String(text) => text.clone(),
             _ => continue,
         };
-        let read = count(&text).ok().and_then(|number| i64::try_from(number).ok());
+        let read = parse_count(&text).ok().and_then(|number| i64::try_from(number).ok());
         let refused = || {
             format!(
                 "{section}.{} = {value}: must be a whole number, such as 1000, 1e5 or 30k",

@@ -58,7 +58,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
         put(
             &mut table,
             &["actors", "max"],
-            count.min(ActorsConfig::GREATEST_MAX.into()).into(),
+            count.min(ActorsConfig::MAX_ACTORS.into()).into(),
         )?;
         sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
     }

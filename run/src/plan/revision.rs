@@ -7,7 +7,7 @@
 use std::collections::BTreeSet;
 
 use anyhow::{Context, bail};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::config::{Change, Config, Difference, Mode};
 use shoal_common::run_dir::RunDir;
 use shoal_common::section;
@@ -113,7 +113,7 @@ impl Revision {
     }
 
     /// Whether it changes this key.
-    pub fn changes(&self, key: &str) -> bool {
+    pub fn changes_key(&self, key: &str) -> bool {
         self.changes.iter().any(|(change, _)| change.key == key)
     }
 
@@ -303,15 +303,9 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
 
 /// The number of the newest round of which a part is in the replay; 0 without a replay.
 fn newest_round(config: &Config, run: &RunDir) -> anyhow::Result<u64> {
-    match CommitReader::open(&run.replay_file()) {
-        Ok(reader) => {
-            let actors = 0..config.actors.max as usize;
-            Ok(actors
-                .map(|actor| reader.actor(actor).last_chunk.sequence)
-                .max()
-                .unwrap_or(0))
-        }
-        Err(OpenError::NotYet { .. }) => Ok(0),
-        Err(error) => Err(error.into()),
-    }
+    let Some(commits) = CommitReader::open_if_ready(&run.replay_file())? else {
+        return Ok(0);
+    };
+    let rounds = (0..config.actors.max as usize).map(|actor| commits.committed(actor).sequence);
+    Ok(rounds.max().unwrap_or(0))
 }

@@ -67,7 +67,7 @@ fn sections(what: &str) -> anyhow::Result<(String, Table, SettingSources)> {
         return Ok((name, table, SettingSources::default()));
     }
     let path = PathBuf::from(what);
-    if path.extension().is_none_or(|extension| extension != "toml") {
+    if !is_configuration_file(&path) {
         return Err(UsageError(no_preset(what)).into());
     }
     let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {what}"))?;
@@ -79,6 +79,11 @@ fn sections(what: &str) -> anyhow::Result<(String, Table, SettingSources)> {
         .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
     let sources = SettingSources::of_file(what, &text);
     Ok((name, table, sources))
+}
+
+/// Whether this is the name of a file with a configuration, as opposed to a preset.
+pub fn is_configuration_file(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "toml")
 }
 
 /// The error for a name that is neither a preset nor a file with settings.

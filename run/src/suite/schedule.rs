@@ -6,15 +6,16 @@ use std::process::Command;
 use std::sync::mpsc::Sender;
 
 use anyhow::bail;
+use shoal_common::message::one_line;
 use shoal_common::run_dir::RunDir;
 use signal_hook::consts::SIGTERM;
 
 use super::configuration::{overrides_of, requested};
 use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
-use crate::external_environment::tied;
+use crate::child_process::tied;
 use crate::interrupted_start::remove_interrupted_start;
-use crate::jobs::{TrainingEnd, run_jobs, run_training};
+use crate::jobs::{TrainingEnd, run_jobs, run_training, trainings_for_all_cores};
 use crate::plan::{self, Revision, RunOverrides};
 use crate::preflight;
 use crate::signals::Signals;
@@ -92,10 +93,10 @@ pub fn train(
     }
     if signals.received().is_none() {
         let is_due =
-            |trial: &Trial| Ok(!suite.has_ended(trial) && !check_finished(suite, &directory.join(&trial.name))?);
+            |trial: &Trial| Ok(!suite.was_ended_early(trial) && !check_finished(suite, &directory.join(&trial.name))?);
         Due::new(suite, directory, is_due, jobs)?.train(signals, None, observer, &mut failed);
     }
-    failed.retain(|number| !suite.has_ended(&suite.trials[*number]));
+    failed.retain(|number| !suite.was_ended_early(&suite.trials[*number]));
     Ok(failed.len())
 }
 
@@ -160,7 +161,7 @@ impl<'a> Due<'a> {
                 Ok(TrainingEnd::Finished) => Event::Finished(number),
                 Ok(TrainingEnd::Interrupted) if signals.received().is_none() => Event::Paused(number),
                 Ok(TrainingEnd::Interrupted) => Event::Interrupted(number),
-                Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
+                Err(error) => Event::Failed(number, one_line(error)),
             });
         };
         run_jobs(numbers, jobs, signals, work, |event| {
@@ -173,7 +174,7 @@ impl<'a> Due<'a> {
     }
 }
 
-/// What cores and shared memory allow; each run keeps about two cores busy.
+/// The number of runs at a time that cores and shared memory allow.
 fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<usize> {
     let trial = &suite.trials[first];
     let overrides = overrides_of(suite, trial)?;
@@ -185,8 +186,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<u
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
         .unwrap_or(1);
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    Ok((cores / 2).clamp(1, fit.max(1)))
+    Ok(trainings_for_all_cores().min(fit.max(1)))
 }
 
 /// Whether nothing is left to do in this run directory.

@@ -1,11 +1,12 @@
 //! The progress of a suite: a live line, or a line for each event where standard error is no terminal.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use shoal_common::message::say;
 use shoal_run::numbers::thousands;
 use shoal_run::suite::Suite;
 use shoal_run::suite::measure::{best_return, distance, final_return};
@@ -30,8 +31,7 @@ impl<'a> SuiteProgress<'a> {
 
     fn print(&self, line: &str) {
         if !self.quiet {
-            // A closed standard error is no reason to fail.
-            let _ = writeln!(std::io::stderr(), "{line}");
+            say(line);
         }
     }
 }
@@ -221,10 +221,7 @@ impl TrainingProgress {
 
     fn print(&self, line: &str) {
         if !self.quiet {
-            self.bar.suspend(|| {
-                // A closed standard error is no reason to fail.
-                let _ = writeln!(std::io::stderr(), "{line}");
-            });
+            self.bar.suspend(|| say(line));
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Invalid answers of environments. Too many end the run.
 
 use anyhow::bail;
-use shoal_actor::environment::GIVEN_UP;
+use shoal_actor::environment::EPISODES_DROPPED;
 use shoal_common::channel::environment::ResponseFault;
 use shoal_common::role::Role;
 use shoal_run::records::recorder::{Incident, IncidentKind};
@@ -26,7 +26,11 @@ impl Supervisor {
         let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
         if let Some(server) = server {
             // A server that checks its own answers has logged the fault, otherwise its client has.
-            let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
+            let by_client = self
+                .log
+                .last_lines(client)
+                .pop()
+                .filter(|line| line.contains(EPISODES_DROPPED));
             let last = by_client.filter(|line| !line.contains(&ResponseFault::Reported.to_string()));
             let last = last
                 .or_else(|| self.log.last_lines(&name(server.instance)).pop())

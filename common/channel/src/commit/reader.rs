@@ -90,6 +90,18 @@ impl CommitReader {
         Ok(reader)
     }
 
+    /// As [`open`](Self::open), but `None` while the learner has not created the file, or must repair its record first.
+    ///
+    /// # Errors
+    /// When waiting for the learner does not help.
+    pub fn open_if_ready(path: &Path) -> Result<Option<Self>, OpenError> {
+        match Self::open(path) {
+            Ok(reader) => Ok(Some(reader)),
+            Err(OpenError::NotYet { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// The file's layout.
     pub fn layout(&self) -> &ReplayLayout {
         &self.layout

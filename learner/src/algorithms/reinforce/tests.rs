@@ -34,7 +34,7 @@ fn settings(weight: ReturnWeighting) -> config::ReinforceConfig {
 fn algorithm(settings: &config::ReinforceConfig) -> Reinforce {
     let mut algorithm = Reinforce::new(settings, &spec(), 1, SIZES).unwrap();
     let mut numbers = stream(1, Purpose::Sampling, 0, 0);
-    for network in std::iter::once(&mut algorithm.policy).chain(&mut algorithm.baseline) {
+    for NetworkWithPass { network, .. } in std::iter::once(&mut algorithm.policy).chain(&mut algorithm.baseline) {
         network
             .parameters
             .iter_mut()
@@ -172,7 +172,7 @@ fn the_gradient_is_that_of_the_objective() {
             ..settings(weight)
         };
         let mut algorithm = algorithm(&settings);
-        let before = algorithm.policy.parameters.to_vec();
+        let before = algorithm.policy.network.parameters.to_vec();
         algorithm.learn(&steps);
         let weights = |episode: &Episode| -> Vec<f64> {
             let returns = episode.returns();
@@ -187,10 +187,13 @@ fn the_gradient_is_that_of_the_objective() {
             returns.iter().enumerate().map(weight_of).collect()
         };
         let episodes = [(&long, weights(&long)), (&short, weights(&short))];
-        let descended = algorithm.policy.gradient.to_vec();
-        assert_finite_differences(&algorithm.policy.layout, &before, &descended, |layout, parameters| {
-            -objective(layout, parameters, &episodes)
-        });
+        let descended = algorithm.policy.network.gradient.to_vec();
+        assert_finite_differences(
+            &algorithm.policy.network.layout,
+            &before,
+            &descended,
+            |layout, parameters| -objective(layout, parameters, &episodes),
+        );
     }
 }
 
@@ -198,9 +201,9 @@ fn the_gradient_is_that_of_the_objective() {
 fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
     let episode = Episode::random(3, 12, true);
     let mut algorithm = algorithm(&settings(ReturnWeighting::Baseline));
-    let before = algorithm.policy.parameters.to_vec();
+    let before = algorithm.policy.network.parameters.to_vec();
     let baseline = algorithm.baseline.as_ref().unwrap();
-    let (layout, values) = (baseline.layout, baseline.parameters.to_vec());
+    let (layout, values) = (baseline.network.layout, baseline.network.parameters.to_vec());
     algorithm.learn(&episode.steps());
     let deltas = |values: &[f32]| -> Vec<f64> {
         let steps = episode.steps();
@@ -208,11 +211,14 @@ fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
         each.map(|(step, g)| g - output(&layout, values, step.s)[0]).collect()
     };
     let weights = [(&episode, deltas(&values))];
-    let descended = algorithm.policy.gradient.to_vec();
-    assert_finite_differences(&algorithm.policy.layout, &before, &descended, |layout, parameters| {
-        -objective(layout, parameters, &weights)
-    });
-    let descended = algorithm.baseline.as_ref().unwrap().gradient.to_vec();
+    let descended = algorithm.policy.network.gradient.to_vec();
+    assert_finite_differences(
+        &algorithm.policy.network.layout,
+        &before,
+        &descended,
+        |layout, parameters| -objective(layout, parameters, &weights),
+    );
+    let descended = algorithm.baseline.as_ref().unwrap().network.gradient.to_vec();
     assert_finite_differences(&layout, &values, &descended, |_, values| {
         deltas(values).iter().map(|delta| delta * delta / 2.0).sum::<f64>() / 12.0
     });
@@ -225,31 +231,31 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
         learn_at_limit: false,
         ..settings(ReturnWeighting::Return)
     });
-    let before = skips.policy.parameters.to_vec();
+    let before = skips.policy.network.parameters.to_vec();
     skips.learn(&cut.steps());
-    assert_eq!(*skips.policy.parameters, before);
+    assert_eq!(*skips.policy.network.parameters, before);
     assert_eq!(skips.steps, [0.0]);
 
     let mut learns = algorithm(&settings(ReturnWeighting::Return));
     learns.learn(&cut.steps());
-    assert_ne!(*learns.policy.parameters, before);
+    assert_ne!(*learns.policy.network.parameters, before);
 
     // From a round with both, `skips` learns only from the episode that terminated.
     let mut alone = skips.clone();
     alone.learn(&over.steps());
     skips.learn(&[cut.steps(), over.steps()].concat());
-    assert_eq!(*skips.policy.parameters, *alone.policy.parameters);
+    assert_eq!(*skips.policy.network.parameters, *alone.policy.network.parameters);
     let mut unfinished = learns.clone();
     unfinished.learn(&over.steps()[..4]);
-    assert_eq!(*unfinished.policy.parameters, *learns.policy.parameters);
+    assert_eq!(*unfinished.policy.network.parameters, *learns.policy.network.parameters);
 }
 
 #[test]
 fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
     let mut algorithm = algorithm(&settings(ReturnWeighting::Normalised));
-    let before = algorithm.policy.parameters.to_vec();
+    let before = algorithm.policy.network.parameters.to_vec();
     algorithm.learn(&Episode::random(4, 1, true).steps());
-    assert_eq!(*algorithm.policy.parameters, before);
+    assert_eq!(*algorithm.policy.network.parameters, before);
 }
 
 #[test]

@@ -117,6 +117,6 @@ fn continuous_observations_are_refused() {
         refused
             .unwrap_err()
             .to_string()
-            .contains("sarsa needs a discrete observation space")
+            .contains("it needs a discrete observation space")
     );
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use shoal_common::message::one_line;
 
 /// Why a record was not written or read.
 #[derive(Debug, thiserror::Error)]
@@ -171,9 +172,8 @@ fn record_error(path: &Path, error: csv::Error) -> RecordError {
 }
 
 fn malformed(path: &Path, error: &csv::Error) -> RecordError {
-    let reason = error.to_string().replace('\n', " ");
     RecordError::Malformed {
         path: path.to_owned(),
-        reason,
+        reason: one_line(error),
     }
 }

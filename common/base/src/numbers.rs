@@ -1,0 +1,38 @@
+//! Sums and checks of slices of numbers.
+
+/// Mean and sample standard deviation; the latter is 0 for fewer than two numbers.
+pub fn mean_and_std(numbers: &[f64]) -> (f64, f64) {
+    let n = numbers.len() as f64;
+    let mean = numbers.iter().sum::<f64>() / n;
+    if numbers.len() < 2 {
+        return (mean, 0.0);
+    }
+    let squares: f64 = numbers.iter().map(|number| (number - mean).powi(2)).sum();
+    (mean, (squares / (n - 1.0)).sqrt())
+}
+
+/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector
+/// instructions.
+pub fn are_finite(numbers: &[f32]) -> bool {
+    numbers.iter().fold(true, |all, number| all & number.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deviation_is_that_of_a_sample() {
+        assert_eq!(mean_and_std(&[1.0, 3.0]), (2.0, 2.0_f64.sqrt()));
+        assert_eq!(mean_and_std(&[5.0]), (5.0, 0.0));
+        assert!(mean_and_std(&[]).0.is_nan());
+    }
+
+    #[test]
+    fn one_number_that_is_not_finite_is_found_anywhere() {
+        assert!(are_finite(&[]) && are_finite(&[f32::MAX, -0.0]));
+        for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            assert!(!are_finite(&[wrong, 0.0]) && !are_finite(&[0.0, wrong]));
+        }
+    }
+}
