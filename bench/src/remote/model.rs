@@ -38,9 +38,9 @@ pub(super) struct Costs {
 /// Who shares a station.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Shared {
-    ByNobody,
-    ByActorsOfAHost,
-    ByAll,
+    Nobody,
+    ActorsOfAHost,
+    All,
 }
 
 /// The station that first keeps a run from becoming faster.
@@ -60,12 +60,12 @@ pub(super) const INTAKE: &str = "the learner's intake";
 impl Costs {
     fn stations(&self) -> [(&'static str, f64, Shared); 6] {
         [
-            ("an actor", self.think, Shared::ByNobody),
-            (RELAY, self.relay, Shared::ByActorsOfAHost),
-            (HOST_LINK, self.host_link, Shared::ByActorsOfAHost),
-            (LEARNER_LINK, self.learner_link, Shared::ByAll),
-            (GATE, self.gate, Shared::ByAll),
-            (INTAKE, self.intake, Shared::ByAll),
+            ("an actor", self.think, Shared::Nobody),
+            (RELAY, self.relay, Shared::ActorsOfAHost),
+            (HOST_LINK, self.host_link, Shared::ActorsOfAHost),
+            (LEARNER_LINK, self.learner_link, Shared::All),
+            (GATE, self.gate, Shared::All),
+            (INTAKE, self.intake, Shared::All),
         ]
     }
 
@@ -74,9 +74,9 @@ impl Costs {
         let window = f64::from(self.window);
         let stations = self.stations().map(|(_, service, shared)| {
             let sharing = match shared {
-                Shared::ByNobody => 1.0,
-                Shared::ByActorsOfAHost => f64::from(actors),
-                Shared::ByAll => f64::from(hosts) * f64::from(actors),
+                Shared::Nobody => 1.0,
+                Shared::ActorsOfAHost => f64::from(actors),
+                Shared::All => f64::from(hosts) * f64::from(actors),
             };
             (service, sharing)
         });
@@ -110,9 +110,9 @@ impl Costs {
         };
         for (station, service, shared) in self.stations() {
             let actors = match shared {
-                Shared::ByNobody => continue,
-                Shared::ByActorsOfAHost => f64::from(hosts) / (alone * service),
-                Shared::ByAll => 1.0 / (alone * service),
+                Shared::Nobody => continue,
+                Shared::ActorsOfAHost => f64::from(hosts) / (alone * service),
+                Shared::All => 1.0 / (alone * service),
             };
             if actors < first.actors {
                 first = Bottleneck { station, actors };
