@@ -24,6 +24,7 @@ use shoal_common::channel::control::{ControlPort, ControlRequest, ControlRespons
 use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
+use shoal_common::message::one_line;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
@@ -105,6 +106,28 @@ pub(crate) struct RunOptions {
 
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
 pub(crate) fn run(
+    config: Config,
+    (run, lock): (&RunDir, &RunLock),
+    signals: &Signals,
+    options: RunOptions,
+) -> anyhow::Result<TrainingOutcome> {
+    let ended = run_and_renew(config, (run, lock), signals, options);
+    if let Err(error) = &ended
+        && lock.check(run).is_ok()
+        && let Ok(Some(outcome)) = RunOutcome::read(run)
+        && outcome.state == RunState::Running
+    {
+        // The roles were never started, so no launcher has written how the run ended.
+        let state = RunState::Failed;
+        let failed = RunOutcome { state, ..outcome }.with_reason(one_line(error));
+        // An error here must not hide the original one.
+        let _ = failed.write(run);
+    }
+    ended
+}
+
+/// Runs all roles, again and again while their shared memory must be made anew.
+fn run_and_renew(
     mut config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
@@ -278,7 +301,7 @@ impl<'a> Launcher<'a> {
         let renewed = matches!(ending, Ok(RunEnd::Renewed));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
         if let Some(error) = failure {
-            let why = format!("{error:#}").replace('\n', " ");
+            let why = one_line(error);
             self.log.note("launcher", &format!("{FAILED}{why}"));
             // An error here must not hide the original one.
             let _ = self

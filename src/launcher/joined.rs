@@ -7,6 +7,7 @@ use shoal_common::channel::Domain;
 use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::reports::Reports;
 use shoal_common::config::Config;
+use shoal_common::message::one_line;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
@@ -121,7 +122,7 @@ impl<'a> JoinedLauncher<'a> {
         self.await_end(|_| true, OTHERS_END);
         self.control.answer_waiting(&ControlResponse::Accepted);
         if let Err(error) = &ending {
-            self.log.note("launcher", &format!("{error:#}").replace('\n', " "));
+            self.log.note("launcher", &one_line(error));
         }
         ending
     }
