@@ -13,6 +13,7 @@ pub fn mean_and_std(numbers: &[f64]) -> (f64, f64) {
 
 /// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector
 /// instructions.
+#[inline]
 pub fn are_finite(numbers: &[f32]) -> bool {
     numbers.iter().fold(true, |all, number| all & number.is_finite())
 }
