@@ -214,7 +214,10 @@ fn resuming_a_copy_of_a_running_run_is_refused() {
     let outcome = std::fs::read_to_string(place.path().join("copy/outcome.json")).unwrap();
     let outcome: serde_json::Value = serde_json::from_str(&outcome).unwrap();
     assert_eq!(outcome["state"], "failed", "{outcome}");
-    assert!(outcome["reason"].as_str().unwrap().contains("is a copy of"), "{outcome}");
+    assert!(
+        outcome["reason"].as_str().unwrap().contains("is a copy of"),
+        "{outcome}"
+    );
     running.wait_for_learning();
 }
 

@@ -491,7 +491,7 @@ mod tests {
         for (text, part) in [
             ("", damaged),
             ("{}\n", damaged),
-            ("{\"format\":99}\n", "format 99, this program reads 2"),
+            ("{\"format\":99}\n", "has format 99; this program reads format 2"),
             (
                 &lines.replacen("point-mass-r2", "point-mass-r1", 1),
                 "the results of point-mass-r1",

@@ -5,17 +5,16 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{RoleState, RoleStatus};
-use shoal_common::report::Heartbeat;
+use shoal_common::report::{Heartbeat, PROVEN_STEPS};
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_run::records::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
 use super::process::Process;
 
-/// A process that has lived this long, or an environment server that has taken this many steps, is able to work. A
+/// A process that has lived this long, or an environment server that has taken [`PROVEN_STEPS`], is able to work. A
 /// process that repeatedly fails earlier is not.
 const PROVEN: Duration = Duration::from_secs(30);
-const PROVEN_STEPS: u64 = 1000;
 
 /// Failed starts after which a role is given up, if they span `run.give_up_seconds` and twice its longest start.
 const MAX_FAILURES: u32 = 5;
