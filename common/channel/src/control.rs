@@ -235,6 +235,8 @@ pub fn ask(
     let notify = || launcher.iter().for_each(Notifier::notify);
     let mut pending = ask(&request)?;
     notify();
+    // Making the client writes files, which takes seconds where the disk is busy. That is no silence of the launcher.
+    let deadline = Instant::now() + patience;
     let mut checked = Instant::now();
     let mut gone = false;
     loop {
