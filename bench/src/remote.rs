@@ -4,11 +4,12 @@
 mod cable;
 mod hosts;
 mod model;
-mod processes;
+mod usage;
 
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
+use shoal_common::config::RemoteConfig;
 
 use self::cable::Cable;
 use self::hosts::{Network, RemoteRun};
@@ -20,39 +21,47 @@ use super::temporary_run::TemporaryRun;
 
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// Rows of a chunk, chunks of a window, and actors of the host whose rate is measured.
+/// Rows of a chunk.
 const CHUNK_ROWS: u32 = 64;
-const WINDOW: u32 = 64;
-const ACTORS: u32 = 8;
 
-/// The limited cable.
-const GIGABIT: u64 = 1_000_000_000;
+/// Actors of the host whose rate is measured, and chunks of the window of each.
+const ACTORS: u32 = 8;
+const WINDOW: u32 = 64;
+
+/// Bits a second of the limited cable.
+const FAST_CABLE: u64 = 1_000_000_000;
 
 /// What a gigabit a second carries of rows of Pendulum in chunks, 64 × 40 bytes and a header, with TCP's and IP's own
 /// headers.
 const GIGABIT_ROWS: f64 = 2.84e6;
 
-/// For the model: a slow cable, the time in which an actor fills a chunk, the default window, and numbers of actors.
-const SLOW: u64 = 100_000_000;
-const THINK: Duration = Duration::from_millis(1);
-const DEFAULT_WINDOW: u32 = 8;
-const COUNTS: [u32; 4] = [1, 2, 4, 8];
+/// Bits a second of the cable over which the model is compared with measurements.
+const SLOW_CABLE: u64 = 100_000_000;
 
-/// A policy of Pendulum with the thesis's networks, how many a learner publishes a second (every fourth of 600 updates),
-/// and the default of `remote.policy_bandwidth`, all in bytes.
+/// The numbers of actors for which it is compared.
+const MODELLED_ACTORS: [u32; 4] = [1, 2, 4, 8];
+
+/// The time in which each of them fills a chunk.
+const FILL_TIME: Duration = Duration::from_millis(1);
+
+/// The default of `actors.window`.
+const DEFAULT_WINDOW: u32 = 8;
+
+/// Bytes of a policy of Pendulum with the thesis's networks.
 const POLICY_BYTES: f64 = 488_804.0;
-const PUBLISHED: f64 = 150.0;
-const POLICY_BANDWIDTH: f64 = 30e6;
+
+/// Policies that a learner publishes a second: every fourth of 600 gradient steps makes one.
+const PUBLISHED_PER_SECOND: f64 = 150.0;
 
 /// Hosts that join one gate, and the actors of each.
-const MANY: (u32, u32) = (32, 8);
+const MANY_HOSTS: (u32, u32) = (32, 8);
 
-/// Those that the model is asked about.
-const EXPECTED: (u32, u32) = (32, 32);
+/// Hosts and actors of each for which the model alone is asked.
+const MODELLED_HOSTS: (u32, u32) = (32, 32);
 
 /// The first pause of the cable, and by how much each is longer than the one before.
-const OUTAGE: Duration = Duration::from_millis(1_000);
-const LONGER_OUTAGE: Duration = Duration::from_millis(700);
+const SHORTEST_OUTAGE: Duration = Duration::from_millis(1_000);
+const OUTAGE_STEP: Duration = Duration::from_millis(700);
 
 /// How long rows may take to come back.
 const RETURN_TIMEOUT: Duration = Duration::from_secs(60);
@@ -141,10 +150,10 @@ struct ManyFigures {
 
 pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
     let [rates, outages, many, modelled] = SHARES.map(|share| budget.length.mul_f64(share));
-    let loopback = over(&Network::Loopback, rates, budget)?;
+    let loopback = measure_link(&Network::Loopback, rates, budget)?;
     let cables = || -> anyhow::Result<_> {
         let cable = |limit| Cable::new(limit).map(Network::Cable);
-        Ok([cable(None)?, cable(Some(GIGABIT))?, cable(Some(SLOW))?])
+        Ok([cable(None)?, cable(Some(FAST_CABLE))?, cable(Some(SLOW_CABLE))?])
     };
     let mut figures = RemoteFigures {
         chunk_rows: CHUNK_ROWS,
@@ -154,15 +163,15 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
         cable: None,
         gigabit: None,
         outages: None,
-        many: join_many(many, budget)?,
+        many: measure_many_hosts(many, budget)?,
         model: None,
         no_cable: None,
     };
     match cables() {
         Ok([unlimited, gigabit, slow]) => {
-            let cable = over(&unlimited, rates, budget)?;
-            figures.gigabit = Some(over(&gigabit, rates, budget)?);
-            figures.outages = Some(interrupt(&unlimited, outages, budget)?);
+            let cable = measure_link(&unlimited, rates, budget)?;
+            figures.gigabit = Some(measure_link(&gigabit, rates, budget)?);
+            figures.outages = Some(measure_outages(&unlimited, outages, budget)?);
             figures.model = Some(predict(&cable, &slow, modelled, budget)?);
             figures.cable = Some(cable);
         }
@@ -191,12 +200,12 @@ fn temporary_run(actors: u32, window: u32) -> anyhow::Result<TemporaryRun> {
 }
 
 /// The rate of one host.
-fn over(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<LinkFigures> {
+fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<LinkFigures> {
     let temporary = temporary_run(ACTORS, WINDOW)?;
     RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
         run.send_for(length.mul_f64(WARM_UP))?;
         let observed = [run.gate(), run.relay(), run.learner()];
-        let busy = || -> anyhow::Result<_> { observed.into_iter().map(processes::busy).collect() };
+        let busy = || -> anyhow::Result<_> { observed.into_iter().map(usage::busy).collect() };
         let before: Vec<Duration> = busy()?;
         let begun = Instant::now();
         let mut rates = IntervalResults::default();
@@ -219,7 +228,7 @@ fn over(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Res
 }
 
 /// Unplugs the cable several times, each time for longer.
-fn interrupt(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageFigures> {
+fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageFigures> {
     let Network::Cable(cable) = network else {
         anyhow::bail!("only a cable can be unplugged");
     };
@@ -230,7 +239,7 @@ fn interrupt(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow
         for i in 0..intervals::count(length, 1.0, Duration::from_secs_f64(0.13)) as u32 {
             run.send_for(INTERVAL)?;
             cable.set_plugged(false)?;
-            run.send_for(OUTAGE + LONGER_OUTAGE * i)?;
+            run.send_for(SHORTEST_OUTAGE + OUTAGE_STEP * i)?;
             // Nothing is under way between relay and replay any more.
             let before = run.rows();
             cable.set_plugged(true)?;
@@ -264,7 +273,7 @@ fn predict(
     let mut costs = Costs {
         think: 0.0,
         relay: unlimited.relay_cores / chunks_per_second,
-        host_link: of_gigabit * GIGABIT as f64 / SLOW as f64,
+        host_link: of_gigabit * FAST_CABLE as f64 / SLOW_CABLE as f64,
         learner_link: 0.0,
         gate: unlimited.gate_cores / chunks_per_second,
         intake: unlimited.learner_cores / chunks_per_second,
@@ -272,19 +281,19 @@ fn predict(
         window: 1,
     };
     // A single chunk under way waits for nothing but the delay.
-    let alone = paced(slow, 1, 1, Duration::ZERO, length, budget)?;
+    let alone = chunks_per_second_at_pace(slow, 1, 1, Duration::ZERO, length, budget)?;
     costs.delay = (1.0 / alone - 1.0 / costs.throughput(1, 1)).max(0.0);
-    (costs.think, costs.window) = (THINK.as_secs_f64(), DEFAULT_WINDOW);
+    (costs.think, costs.window) = (FILL_TIME.as_secs_f64(), DEFAULT_WINDOW);
     let row = |actors: u32| -> anyhow::Result<ModelRow> {
-        let measured = paced(slow, actors, DEFAULT_WINDOW, THINK, length, budget)?;
+        let measured = chunks_per_second_at_pace(slow, actors, DEFAULT_WINDOW, FILL_TIME, length, budget)?;
         Ok(ModelRow {
             actors,
             rows_per_second: measured * f64::from(CHUNK_ROWS),
             expected: costs.throughput(1, actors) * f64::from(CHUNK_ROWS),
         })
     };
-    let rows = COUNTS.into_iter().map(row).collect::<anyhow::Result<_>>()?;
-    let (hosts, actors) = EXPECTED;
+    let rows = MODELLED_ACTORS.into_iter().map(row).collect::<anyhow::Result<_>>()?;
+    let (hosts, actors) = MODELLED_HOSTS;
     let many = Costs {
         host_link: of_gigabit,
         learner_link: of_gigabit,
@@ -301,16 +310,16 @@ fn predict(
         policy_age: policy_age(
             POLICY_BYTES,
             hosts,
-            PUBLISHED,
-            POLICY_BANDWIDTH,
-            GIGABIT as f64 / 8.0,
+            PUBLISHED_PER_SECOND,
+            RemoteConfig::default().policy_bandwidth,
+            FAST_CABLE as f64 / 8.0,
             costs.delay,
         ),
     })
 }
 
 /// Chunks a second of a host's actors, each of which needs `think` to fill one.
-fn paced(
+fn chunks_per_second_at_pace(
     network: &Network,
     actors: u32,
     window: u32,
@@ -329,10 +338,10 @@ fn paced(
 }
 
 /// Many hosts at one gate, which is killed once.
-fn join_many(length: Duration, budget: &TimeBudget) -> anyhow::Result<ManyFigures> {
-    let (hosts, actors) = MANY;
+fn measure_many_hosts(length: Duration, budget: &TimeBudget) -> anyhow::Result<ManyFigures> {
+    let (hosts, actors) = MANY_HOSTS;
     let temporary = temporary_run(hosts * actors, DEFAULT_WINDOW)?;
-    RemoteRun::with(&temporary, &Network::Loopback, MANY, budget, |run| {
+    RemoteRun::with(&temporary, &Network::Loopback, MANY_HOSTS, budget, |run| {
         run.send_for(length.mul_f64(WARM_UP))?;
         let (begun, before) = (Instant::now(), run.rows_of_hosts());
         run.send_for(length.mul_f64(1.0 - WARM_UP))?;
@@ -345,7 +354,7 @@ fn join_many(length: Duration, budget: &TimeBudget) -> anyhow::Result<ManyFigure
         let [least, most] = [of_hosts.iter().min(), of_hosts.iter().max()].map(|rows| rows.copied().unwrap_or(0));
         let gate = run.gate();
         let memory = Memory::of(gate, &temporary.run.replay_file())?;
-        let gate_open_files = processes::open_files(gate)?;
+        let gate_open_files = usage::open_files(gate)?;
         let killed = Instant::now();
         run.replace_gate()?;
         let before = run.rows_of_hosts();

@@ -174,15 +174,14 @@ impl<'a> Gate<'a> {
         let (config, run) = (&settings.config, &settings.run);
         let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let replay = loop {
-            match CommitReader::open(&run.replay_file()) {
-                Ok(replay) => break replay,
-                Err(OpenError::NotYet { .. }) if stop.requested() => return Ok(None),
-                Err(OpenError::NotYet { .. }) => {
-                    std::thread::sleep(LONGEST_SLEEP);
-                    heartbeat.beat(Activity::WaitingForPeer);
-                }
-                Err(error) => return Err(error.into()),
+            if let Some(replay) = CommitReader::open_if_ready(&run.replay_file())? {
+                break replay;
             }
+            if stop.requested() {
+                return Ok(None);
+            }
+            std::thread::sleep(LONGEST_SLEEP);
+            heartbeat.beat(Activity::WaitingForPeer);
         };
         let layout = config.policy_layout()?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;

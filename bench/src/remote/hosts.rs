@@ -10,7 +10,7 @@ use rustix::process::Signal;
 use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, HostLease};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, Services};
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::{RunDir, RunLock};
@@ -371,7 +371,7 @@ impl<'a> RemoteRun<'a> {
             ended = ended.and(host.end());
         }
         self.gate.ask_to_end();
-        // It says goodbye to its hosts; the launcher answers meanwhile.
+        // It tells its hosts that it ends, and its launcher answers meanwhile.
         let deadline = Instant::now() + STARTUP_TIMEOUT;
         while self.gate.wait(ANSWER_INTERVAL).is_none() && Instant::now() < deadline {
             ended = ended.and(self.launcher.answer());
@@ -505,13 +505,13 @@ fn gate_process(network: &Network, temporary: &TemporaryRun, incarnation: u64) -
 fn wait_for_file(path: &Path, mut check: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<CommitReader> {
     let begun = Instant::now();
     loop {
-        match CommitReader::open(path) {
-            Ok(reader) => return Ok(reader),
-            Err(OpenError::NotYet { .. }) if begun.elapsed() < STARTUP_TIMEOUT => {
-                check()?;
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            Err(error) => return Err(error.into()),
+        if let Some(reader) = CommitReader::open_if_ready(path)? {
+            return Ok(reader);
         }
+        if begun.elapsed() >= STARTUP_TIMEOUT {
+            bail!("{} was not made within {} s", path.display(), STARTUP_TIMEOUT.as_secs());
+        }
+        check()?;
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
