@@ -204,6 +204,9 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
     let temporary = temporary_run(ACTORS, WINDOW)?;
     RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
         run.send_for(length.mul_f64(WARM_UP))?;
+        // On a busy machine, a short warm-up may end before the first rows arrive.
+        let before = run.rows();
+        run.send_until(RETURN_TIMEOUT, |run| run.rows() > before)?;
         let observed = [run.gate(), run.relay(), run.learner()];
         let busy = || -> anyhow::Result<_> { observed.into_iter().map(usage::busy).collect() };
         let before: Vec<Duration> = busy()?;

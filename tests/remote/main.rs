@@ -516,9 +516,7 @@ fn the_rates_of_joined_hosts_are_measured_and_nothing_is_left() {
     let temporary = tempfile::TempDir::new().unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_shoal"));
     command.args(["bench", "remote", "--json"]).stdin(Stdio::null());
-    command
-        .env("SHOAL_BENCH_SECONDS", "0.3")
-        .env("TMPDIR", temporary.path());
+    command.env("SHOAL_BENCH_SECONDS", "2").env("TMPDIR", temporary.path());
     let output = output_of(&mut command);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let figures: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();

@@ -18,8 +18,8 @@ use super::files::{SHARED_MEMORY, files_of, prefix};
 use super::memory;
 use super::presence::{self, Claim, Presence};
 
-/// How long to wait for a run's lock. Each process holds it for some milliseconds.
-const LOCK_PATIENCE: Duration = Duration::from_secs(10);
+/// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
+const LOCK_PATIENCE: Duration = Duration::from_secs(30);
 
 /// The node name of processes that join a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
