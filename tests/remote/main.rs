@@ -506,7 +506,6 @@ fn a_host_that_comes_back_too_late_joins_again() {
     });
     wait_for_actors(&run, &[0, 1]);
     assert!(host.place.stderr().contains("joining again"), "{}", host.place.stderr());
-    // So many rows are checked below.
     wait_for_rows(&run.running, 1_100);
     let path = stop(run);
     host.ends_with(0);
