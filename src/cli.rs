@@ -93,14 +93,14 @@ pub(crate) enum Command {
     InNewSession(InNewSessionArgs),
 }
 
-/// The arguments of this program in a session of its own.
+/// Arguments for this program, started in a new session.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct InNewSessionArgs {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     pub(crate) arguments: Vec<OsString>,
 }
 
-/// The arguments with which a program is started that is killed when its parent process dies.
+/// Arguments for starting a program that is killed when its parent process dies.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TiedArgs {
     pub(crate) parent: u32,

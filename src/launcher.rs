@@ -30,7 +30,7 @@ use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
 use shoal_run::external_environment::server_iceoryx2_config;
-use shoal_run::records::outcome::{RunOutcome, RunState, STARTING};
+use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use shoal_run::records::recorder::Recorder;
 use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
@@ -48,7 +48,7 @@ use self::supervisor::{SupervisedHost, Supervisor};
 const TICK: Duration = Duration::from_millis(500);
 const SHORTEST_TICK: Duration = Duration::from_millis(20);
 
-/// The largest part of a report buffer that may be filled in a tick for the next tick to be longer.
+/// If less than this share of a report buffer is filled in a tick, the next tick is longer.
 const LOW_FILL: f64 = 0.1;
 
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
@@ -57,8 +57,9 @@ const LAST_EVALUATION_REPORT: Duration = Duration::from_secs(1);
 /// How long to wait for a learner that is being restarted when the run is asked to stop.
 const LEARNER_RESTART: Duration = Duration::from_secs(5);
 
-/// How long actors may take to hand over their last chunks, and the other roles to end. The learner saves its state.
+/// How long actors may take to send their last chunks.
 const ACTORS_END: Duration = Duration::from_secs(3);
+/// How long the other roles may take to end. The learner saves its state in this time.
 const OTHERS_END: Duration = Duration::from_secs(15);
 
 /// How long the gate may take to let the other hosts hand over their last chunks.
@@ -163,7 +164,8 @@ fn run_once(
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let saved = status::saved_status(&config, run)?;
-    let starts = RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(STARTING);
+    let starts =
+        RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(OutcomeReason::Starting);
     starts.write(run)?;
     Domain::wait_for_earlier_processes(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
@@ -316,7 +318,7 @@ impl<'a> Launcher<'a> {
         let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            RunEnd::Stopped => stopped.with_reason("by request").write(self.run)?,
+            RunEnd::Stopped => stopped.with_reason("by request".to_owned()).write(self.run)?,
             RunEnd::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
             // The final evaluation of a finished run is still to come.
             RunEnd::Finished | RunEnd::Renewed => {}
@@ -407,8 +409,8 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send. Other hosts are told that
-    /// the run is over, or, if it may continue, nothing: then they wait for it.
+    /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over,
+    /// the other hosts are told so. Otherwise they are told nothing, and wait.
     fn end_all(&mut self, is_over: bool) -> anyhow::Result<()> {
         self.ending = true;
         self.end(|role| role == Role::Actor, ACTORS_END);

@@ -111,7 +111,8 @@ impl ListedRun {
         (self.steps, self.episodes_limit) = (Some(config.run.steps), config.run.episodes);
         let returns = read_evaluations(&run.evaluations())?
             .into_iter()
-            .map(|row| row.return_mean);
+            .map(|row| row.return_mean)
+            .filter(|mean| mean.is_finite());
         self.best_return = returns.reduce(f64::max);
         match client.status() {
             Ok(Some(status)) => {

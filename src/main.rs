@@ -51,8 +51,8 @@ fn main() -> ExitCode {
     })
 }
 
-/// Prints what is wrong with the arguments, or what `--help` and `--version` ask for. A value that is refused needs no
-/// more than its line.
+/// Prints what is wrong with the arguments, or what `--help` and `--version` ask for. For a refused value, the first
+/// line says enough.
 fn wrong_usage(error: &clap::Error) -> ExitCode {
     if error.kind() != ErrorKind::ValueValidation {
         error.exit();

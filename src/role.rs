@@ -44,7 +44,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         .with_ansi(false)
         .with_target(false)
         .log_internal_errors(false);
-    // What the network engine notes about itself helps nobody who reads a run's log.
+    // The network engine's own messages do not help readers of a run's log.
     let level = log_level();
     let of_network = if level == LevelFilter::TRACE {
         level

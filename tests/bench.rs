@@ -161,14 +161,14 @@ fn rates_of_several_actors_are_measured_and_predicted() {
                 "{figures}"
             );
             number(rate, "expected_rows_per_second");
-            assert_eq!(rate["updates_per_second"].as_f64().unwrap() > 0.0, updates, "{figures}");
+            assert!(updates || rate["updates_per_second"] == 0.0, "{figures}");
             assert_eq!(rate["expected_updates_per_second"].as_f64().unwrap() > 0.0, updates);
         }
     }
-    let collected = counts
-        .iter()
-        .map(|count| count["collecting"]["rows_per_second"].as_f64().unwrap());
-    assert!(collected.sum::<f64>() > 0.0, "{figures}");
+    for (way, field) in [("collecting", "rows_per_second"), ("learning", "updates_per_second")] {
+        let rates = counts.iter().map(|count| count[way][field].as_f64().unwrap());
+        assert!(rates.sum::<f64>() > 0.0, "{figures}");
+    }
     let one_core = &figures["one_core"];
     number(one_core, "pair_rows_per_second");
     number(one_core, "inference_rows_per_second");
@@ -190,7 +190,8 @@ fn rates_of_several_actors_are_measured_and_predicted() {
     assert_eq!(predicted, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0]);
     for pair in scaling.windows(2) {
         let [few, many] = [0, 1].map(|i| number(&pair[i], "rows_per_second"));
-        assert!(few < many, "more actors, more rows: {figures}");
+        // From the first bottleneck on there are as many rows, except for rounding.
+        assert!(few <= many * (1.0 + 1e-9), "more actors, no fewer rows: {figures}");
         let [few, many] = [0, 1].map(|i| number(&pair[i], "efficiency"));
         assert!(many < few + 1e-6, "{figures}");
     }

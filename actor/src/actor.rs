@@ -103,7 +103,7 @@ struct Actor<'a> {
     n_step: NStepTransitions,
     /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy that took the newest step of `chunk`, or, if that is empty, the newest step sent.
+    /// Version of the policy that chose the newest action.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,

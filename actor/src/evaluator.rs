@@ -1,4 +1,5 @@
-//! The evaluator: runs the newest policy without noise, always from the same start states, and keeps the best one.
+//! The evaluator: runs the newest policy without exploration, always from the same start states, and keeps the best
+//! one.
 
 use std::path::Path;
 use std::rc::Rc;
@@ -132,7 +133,7 @@ struct Best {
 }
 
 impl Best {
-    /// After a learner's death its successor gives versions again, to other policies. So the parameters count too.
+    /// A restarted learner may give a version to another policy, so the parameters are compared too.
     fn is_same_policy(&self, other: &Self) -> bool {
         self.version == other.version && self.parameters == other.parameters
     }

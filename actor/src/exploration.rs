@@ -91,7 +91,8 @@ impl Exploration {
                 let epsilon = epsilon.after(env_steps);
                 let count = values.actions();
                 for (action, values) in actions.iter_mut().zip(values.of(parameters, observations)) {
-                    // Both are always drawn, so that the next environment's numbers do not depend on the first.
+                    // Both are always drawn, so that one environment's choice does not shift the next one's random
+                    // numbers.
                     let (explore, which): (f64, f64) = (stream.random(), stream.random());
                     let any = (which * count as f64) as usize;
                     *action = if explore < epsilon { any } else { argmax(values) } as f32;

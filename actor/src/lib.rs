@@ -1,5 +1,4 @@
-//! The actor, which explores with the policy and its noise and writes transitions, and the evaluator, which acts
-//! without noise.
+//! The actor, which explores and writes transitions, and the evaluator, which acts without exploration.
 
 pub mod actor;
 mod actor_snapshot;

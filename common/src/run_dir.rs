@@ -22,7 +22,7 @@ pub struct RunDir {
 #[derive(Debug, thiserror::Error)]
 pub enum RunDirError {
     /// A run directory is never overwritten.
-    #[error("{0} exists already; choose another directory with --run, or remove it")]
+    #[error("{0} exists already; choose another directory, or remove it")]
     Exists(PathBuf),
     /// There is no run in this directory.
     #[error("{0} is not a run directory: {why}{hint}", why = what_it_is(.0), hint = did_you_mean(.0))]

@@ -38,11 +38,12 @@ pub fn serve(
                     },
                     _ => Reset::Next,
                 };
-                started = true;
                 heartbeat.begin_work();
-                request
+                let refused = request
                     .respond(|_, blocks| environments.reset(reset, blocks.observations))?
-                    .err()
+                    .err();
+                started |= refused.is_none();
+                refused
             }
             Some(RequestKind::Step) if started => {
                 heartbeat.begin_work();

@@ -119,8 +119,8 @@ impl VectorEnvironment {
         })
     }
 
-    /// Draws the first environment into this file after each reset and each step, before an episode that has ended is
-    /// followed by the next one.
+    /// Draws the first environment into this file after each reset and each step; at the end of an episode, before the
+    /// next one begins.
     #[must_use]
     pub fn drawn_into(self, frames: Option<FrameFile>) -> Self {
         Self { frames, ..self }

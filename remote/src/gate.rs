@@ -290,7 +290,7 @@ impl<'a> Gate<'a> {
             return Ok(0);
         };
         host.heard_at = Instant::now();
-        // A host that was admitted again still has processes that an earlier launcher has given incarnations to.
+        // Processes of a host that was admitted again may have incarnations of an earlier lease.
         let ours = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
         let Some(forwarder) = &actor.forwarder else {
@@ -653,7 +653,7 @@ impl<'a> Gate<'a> {
         self.open_forwarders()
     }
 
-    /// The learner wakes nobody but actors, so the gate looks at the commit record: often while chunks are being
+    /// The learner notifies only actors, so the gate looks at the commit record: often while chunks are being
     /// committed, less often while the learner is busy with its updates.
     fn choose_sleep(&mut self, progress: bool) {
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());

@@ -92,7 +92,7 @@ impl<C> UncommittedChunks<C> {
         self.resent
     }
 
-    /// Adds a chunk of the actor. A window of chunks and a handshake are kept at most, or twice that after a power
+    /// Adds a chunk of the actor. At most a window of chunks and a handshake are kept; twice that after a power
     /// loss. One that was added or committed before is ignored, because a new relay receives the history of the actor's
     /// channel; so is one that does not follow on the others.
     pub fn add(&mut self, id: ChunkId, chunk: C, now: Duration) -> ActorFollowUp {

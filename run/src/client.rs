@@ -9,7 +9,7 @@ use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use crate::records::outcome::{FINAL_EVALUATION, RunOutcome, RunState, STARTING};
+use crate::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use crate::status::saved_status;
 
 /// How long a launcher may take to answer. One that is starting, or writes to a busy disk, does not answer at once.
@@ -93,12 +93,10 @@ impl RunClient {
     }
 
     /// Why the launcher has no roles, as the run's outcome tells: it is starting, or in its final evaluation.
-    fn reason_for_no_roles(&self) -> anyhow::Result<Option<&'static str>> {
+    fn reason_for_no_roles(&self) -> anyhow::Result<Option<OutcomeReason>> {
         let outcome = RunOutcome::read(&self.run)?;
         let reason = outcome.and_then(|outcome| outcome.reason);
-        Ok([STARTING, FINAL_EVALUATION]
-            .into_iter()
-            .find(|known| reason.as_deref() == Some(known)))
+        Ok(reason.filter(|reason| !matches!(reason, OutcomeReason::Other(_))))
     }
 
     /// The status, by the run's files, of a run whose launcher has no roles yet, or none any more. `None` if the
@@ -108,16 +106,16 @@ impl RunClient {
             Some(reason) => reason,
             None if matches!(error, ControlError::Silence) => return Ok(None),
             None => match RunOutcome::read(&self.run)?.map(|outcome| outcome.state) {
-                None | Some(RunState::Running) => STARTING,
-                Some(_) => "starting or ending",
+                None | Some(RunState::Running) => OutcomeReason::Starting,
+                Some(_) => OutcomeReason::Other("starting or ending".into()),
             },
         };
-        self.saved(waiting).map(Some)
+        self.saved(&waiting).map(Some)
     }
 
-    fn saved(&self, waiting: &str) -> anyhow::Result<RunStatus> {
+    fn saved(&self, waiting: &OutcomeReason) -> anyhow::Result<RunStatus> {
         Ok(RunStatus {
-            waiting: Some(waiting.into()),
+            waiting: Some(waiting.to_string()),
             ..saved_status(&self.run.config()?, &self.run)?
         })
     }
@@ -125,9 +123,9 @@ impl RunClient {
     /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
         // A launcher that fails while it starts removes its shared memory, and this request with it.
-        let starts = self.reason_for_no_roles()? == Some(STARTING);
+        let starts = self.reason_for_no_roles()? == Some(OutcomeReason::Starting);
         let answer = match self.ask(ControlRequest::Status, PATIENCE) {
-            Err(_) if starts => Some(ControlResponse::Status(self.saved(STARTING)?)),
+            Err(_) if starts => Some(ControlResponse::Status(self.saved(&OutcomeReason::Starting)?)),
             answer => answer?,
         };
         match answer {
@@ -150,8 +148,8 @@ impl RunClient {
         // A launcher that does not answer at all is noticed sooner this way.
         match self.status()? {
             None => bail!("{}", self.not_running()),
-            Some(status) if status.waiting.as_deref() == Some(FINAL_EVALUATION) => bail!(
-                "the training in {} is finished, and its {FINAL_EVALUATION} is under way; Ctrl-C in its terminal or \
+            Some(status) if is_in_final_evaluation(&status) => bail!(
+                "the training in {} is finished, and its final evaluation is under way; Ctrl-C in its terminal or \
                  SIGTERM ends that",
                 self.run.path().display()
             ),
@@ -185,6 +183,12 @@ impl RunClient {
             _ => format!("nothing runs in {here}; `shoal resume {here}` continues it"),
         }
     }
+}
+
+/// Whether the launcher evaluates the run's policies once more.
+pub fn is_in_final_evaluation(status: &RunStatus) -> bool {
+    let final_evaluation = OutcomeReason::FinalEvaluation.to_string();
+    status.waiting == Some(final_evaluation)
 }
 
 fn accepted(answer: ControlResponse) -> anyhow::Result<()> {

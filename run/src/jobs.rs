@@ -32,7 +32,7 @@ pub enum TrainingEnd {
     Interrupted,
 }
 
-/// Works off the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
+/// Processes the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
 /// this thread passes to `observe`; that is also called once a second without an event.
 pub fn run_jobs<Job: Send, Event: Send>(
     queue: VecDeque<Job>,

@@ -1,5 +1,5 @@
 //! The plan of a new run: presets, files and overrides become one resolved configuration, and its directory is created.
-//! No later code reads command-line options.
+//! No later code reads options that change it.
 
 pub mod algorithm;
 mod environment;
@@ -54,7 +54,7 @@ pub struct Plan {
     pub run: RunDir,
     /// Held for as long as this process owns the run.
     pub lock: RunLock,
-    /// What it begins with, if that is not its own.
+    /// The run or dataset that it begins with, if any.
     pub origin: Option<Origin>,
     /// What is worth a warning before it starts.
     pub warnings: Vec<String>,

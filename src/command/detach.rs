@@ -10,12 +10,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use serde::Serialize;
-use shoal_common::channel::control::RunStatus;
 use shoal_common::file_lock;
 use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
-use shoal_run::client::RunClient;
-use shoal_run::records::outcome::FINAL_EVALUATION;
+use shoal_run::client::{RunClient, is_in_final_evaluation};
 use shoal_run::suite::{self, Suite};
 
 use super::training::OutputMode;
@@ -27,7 +25,7 @@ pub(crate) const COMMAND: &str = "in-new-session";
 /// How long the start may take, beside what the environment is allowed (`environment.start_seconds`).
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// How long a process may take to end that is refused because another works already.
+/// How long a second launcher, which is refused because one is running, may take to end.
 const REFUSED_END: Duration = Duration::from_secs(5);
 
 /// Pause between two looks at a run that starts.
@@ -52,8 +50,7 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
     let patience = PATIENCE + Duration::from_secs(of_environment.into());
     let is_at_work = || {
         let status = RunClient::open(path)?.status()?;
-        let is_evaluated = |status: &RunStatus| status.waiting.as_deref() == Some(FINAL_EVALUATION);
-        let works = status.is_some_and(|status| status.all_actors_work() || is_evaluated(&status));
+        let works = status.is_some_and(|status| status.all_actors_work() || is_in_final_evaluation(&status));
         Ok(works && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");

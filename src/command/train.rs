@@ -112,8 +112,8 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         return begun;
     }
     run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
-        // Where no process was started there is nothing to resume or to read, and it would be in the way of the next
-        // try. What is at this path by now may be somebody else's.
+        // If no process was started, the directory is removed, so that its name is free again. By now the path may
+        // belong to somebody else.
         if lock.check(&run).is_ok() && !run.incarnations().exists() {
             let _ = std::fs::remove_dir_all(run.path());
         }

@@ -20,7 +20,7 @@ use shoal_run::evaluation::best_policy::{self, EvaluatedPolicy};
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
-use shoal_run::records::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
+use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use shoal_run::records::recorder::record_final;
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
@@ -36,7 +36,8 @@ pub(crate) struct OutputMode {
     /// Print one JSON object on standard output at the end. Everything else goes to standard error.
     #[arg(long)]
     pub(crate) json: bool,
-    /// Return as soon as it works. It outlives this terminal; `top`, `status` and `stop` find it by its directory.
+    /// Return as soon as all actors work. The run survives this terminal; `top`, `status` and `stop` find it by its
+    /// directory.
     #[arg(long)]
     pub(crate) detach: bool,
 }
@@ -96,7 +97,7 @@ fn train_and_report(
     if outcome.ending == RunEnd::Finished {
         let interrupt = signals.interrupt();
         let under_way = RunOutcome::new(RunState::Running, env_steps, episodes);
-        under_way.with_reason(FINAL_EVALUATION).write(run)?;
+        under_way.with_reason(OutcomeReason::FinalEvaluation).write(run)?;
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
             Ok(policies) => {
                 evaluated = policies;

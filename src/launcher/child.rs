@@ -1,4 +1,4 @@
-//! A child of the supervisor: a role's current process, its progress, and the consequence of its end.
+//! A child of the supervisor: a role's current process, its progress, and what follows when it ends.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -190,8 +190,9 @@ impl Child {
         self.handle_end_at(status, give_up_after, Instant::now())
     }
 
-    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
-    /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
+    /// After a process that was able to work, the role is restarted and its failures are forgotten. A kill is no
+    /// failure either if the process was waiting, had made a step, or was within its usual start-up time. Every other
+    /// end is one.
     fn handle_end_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
@@ -263,7 +264,7 @@ impl Child {
         }
     }
 
-    /// Takes note that the user is told that it is slow; whether that is news.
+    /// Marks it as reported slow. Returns false if it was marked already.
     pub(super) fn mark_reported_slow(&mut self) -> bool {
         !std::mem::replace(&mut self.reported_slow, true)
     }

@@ -27,7 +27,7 @@ pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
         .and_then(|text| text.trim().parse().ok());
     number.filter(|started| *started < MAX_INCARNATION).with_context(|| {
         format!(
-            "{} is damaged: remove it; counting then continues above the incarnations in the replay",
+            "{} is damaged: remove it; the count then continues from the replay's highest incarnation",
             path.display()
         )
     })

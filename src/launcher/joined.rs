@@ -110,7 +110,7 @@ impl<'a> JoinedLauncher<'a> {
     fn run(mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
         let ending = self.watch(give_up);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
-        // have. If the run is over, they try that only for a moment: its learner takes no more than it needs.
+        // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
             Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::LostActors) => {
                 self.supervisor.ask_to_end(|role| role == Role::Actor)

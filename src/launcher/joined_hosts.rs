@@ -63,7 +63,7 @@ impl JoinedHosts {
             .any(|admitted| admitted.lease.actors.contains(&actor))
     }
 
-    /// Admits a host, or gives it something else.
+    /// Admits a host, or replaces the lease of an admitted one.
     pub(super) fn admit(&mut self, lease: HostLease) {
         self.admitted.retain(|admitted| admitted.lease.host != lease.host);
         self.admitted.push(Admitted {

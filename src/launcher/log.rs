@@ -116,7 +116,7 @@ impl Log {
 }
 
 impl Inner {
-    /// Whether the log still takes this line of another program. Says so once it does not.
+    /// Whether the log has room for this line of another program. Logs once that it has none.
     fn takes(&mut self, line: &str) -> bool {
         let length = line.len() as u64 + 1;
         if self.for_programs > 0 && self.for_programs < length {

@@ -16,8 +16,8 @@ use super::supervisor::Supervisor;
 /// The time over which rates are averaged.
 const SPAN: Duration = Duration::from_secs(5);
 
-/// A ratio below this share of the agreed one is explained: until the run is long, the lead that the actors may have
-/// counts.
+/// Below this share of the configured ratio, the progress line explains why. Early in a run, the lead that the actors
+/// may have lowers the ratio.
 const NEARLY: f64 = 0.98;
 
 /// Shows the progress of a run on standard error.
@@ -135,8 +135,8 @@ impl ProgressLine {
         self.bar.set_message(self.line(&learner, supervisor));
     }
 
-    /// One line each for the progress, for the last evaluation and the rates, for the ratio and who waits, and for
-    /// restarts if there were any. Each fits into 80 columns.
+    /// The lines: progress; last evaluation and rates; ratio and waiting role; restarts, if there were any. Each fits
+    /// into 80 columns.
     fn line(&self, learner: &LearnerReport, supervisor: &Supervisor) -> String {
         let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
         let unit = if self.counts_episodes { "episodes" } else { "steps" };

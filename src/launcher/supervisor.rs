@@ -54,7 +54,7 @@ pub(super) enum RunCondition {
     FilesRemoved,
 }
 
-/// The host whose processes are supervised, and with it which processes there are.
+/// The supervised host. It determines which processes there are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum SupervisedHost {
     /// The learner's host, with a gate if other hosts may join.
@@ -463,7 +463,8 @@ impl Supervisor {
             .push(Incident::of(self.children[i].instance, what, detail));
     }
 
-    /// One line: what happened to whom, its last message, and what to do. The log has its earlier messages.
+    /// The error, in one line: the role, what happened, its last message, and what to do. The log has its earlier
+    /// messages.
     fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let lines = self.log.last_lines(name);
         let message = match lines.last() {

@@ -419,7 +419,12 @@ pub(crate) fn check_stored_rows(run: &Path, config: &Config) -> u64 {
         }
     }
     // How many there are depends on the machine, and on how often the torque is at its limit.
-    assert!(seen.len() > 100, "{} of {} rows were compared", seen.len(), replay.rows().count());
+    assert!(
+        seen.len() > 100,
+        "{} of {} rows were compared",
+        seen.len(),
+        replay.rows().count()
+    );
     replay.head()
 }
 

@@ -12,7 +12,8 @@ use std::time::Duration;
 
 use rustix::process::{Signal, getpgrp, getpid, kill_process, kill_process_group};
 
-/// How long a role may take to end after its standard input has closed. The launcher kills it after the same time.
+/// How long a role may take to end after its standard input has closed. After that it ends itself at once. The
+/// launcher has limits of its own, which are not longer.
 pub const GRACE: Duration = Duration::from_secs(15);
 
 const RETIRE: u8 = 1;

@@ -34,8 +34,8 @@ pub struct Transition<'a> {
     pub discount: f32,
     /// Observation `s'` after the step.
     pub s_next: &'a [f32],
-    /// Whether the episode ended with this step, terminated or truncated. For a row of several steps: with the first of
-    /// them.
+    /// Whether the episode ended with this step, terminated or truncated. In a row of several steps: with the
+    /// first of them.
     pub last: bool,
 }
 
@@ -60,8 +60,8 @@ impl RowLayout {
         2 * self.observation + self.action + 3
     }
 
-    /// Words (`u64`) of what an actor with `envs` environments has not put into a chunk yet, if a transition has `n`
-    /// steps: counts of rows, and at most `n` rows for each environment. 0 if `n` is 1.
+    /// Words (`u64`) of the rows that an actor with `envs` environments has not put into a chunk yet, if a transition
+    /// has `n` steps: the counts of rows, and at most `n` rows for each environment. 0 if `n` is 1.
     pub fn n_step_words(&self, n: usize, envs: usize) -> usize {
         match n {
             1 => 0,

@@ -129,7 +129,9 @@ pub enum PeerError {
     #[error("the environment server refused the request")]
     Refused,
     /// The environment server denies having begun the episodes that it has begun.
-    #[error("the environment server denies having begun the episodes that it has begun: it violates the protocol")]
+    #[error(
+        "the environment server says that its episodes have not begun, although they have: it violates the protocol"
+    )]
     EpisodesDenied,
     /// Repeated attempts to connect to the environment server have failed, although it exists.
     #[error("the environment server exists, but cannot be connected to")]

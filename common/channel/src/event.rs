@@ -23,8 +23,8 @@ use super::error::{Cause, ChannelError};
 use super::service::{HeldService, OpenMode, claim, service_name};
 use super::{descriptor, memory};
 
-/// Polls before a waiting process blocks. A peer that works on another core answers while they last. On a shared core
-/// they cost the peer some microseconds.
+/// Polls before a waiting process blocks. A peer on another core usually answers during the polls. On a shared core
+/// they cost it some microseconds.
 const POLLS: u32 = 200;
 
 /// After this many waits in a row without success from polling, a process blocks at once: a peer on the same core gets
@@ -202,7 +202,7 @@ impl Notifier {
 }
 
 /// Waits until `poll` returns something. It polls for a short while, if that has helped recently, and then sleeps at
-/// the listener. While it waits, it calls `refresh` some twenty times a second, which must renew connections.
+/// the listener. Some twenty times a second it calls `refresh`, which must renew the connections.
 ///
 /// # Errors
 /// [`Exit::Stopped`] once `stop` is requested, and the errors of `poll`, `refresh` and the listener.

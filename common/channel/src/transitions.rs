@@ -5,9 +5,9 @@
 //! on top. So `send` never runs out of space, and chunks that a dead learner had not committed reach the next one.
 //!
 //! Chunks of a dead actor still arrive, before any chunk of its successor, if the learner was connected to it. A new
-//! actor cannot know which of them will. So it first sends an empty chunk, its [`Handshake`], and sends no rows until
-//! that one is committed. Then the replay has all it will ever have of the predecessor, and the sequence continues from
-//! there. The documentation of the crate `shoal_learner` has an example.
+//! actor cannot know which chunks will still arrive. So it first sends an empty chunk, its [`Handshake`], and sends no
+//! rows until that one is committed. Then the replay has all it will ever have of the predecessor, and the sequence
+//! continues from there. The documentation of the crate `shoal_learner` has an example.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;

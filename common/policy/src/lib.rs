@@ -31,7 +31,7 @@ pub enum PolicyLayout {
     },
 }
 
-/// Why an algorithm, which the text calls "it", cannot control an environment.
+/// Why an algorithm cannot control an environment. The messages begin with "it", the algorithm.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PolicyError {
     /// A policy with tanh outputs needs real-valued actions.

@@ -49,8 +49,8 @@ pub trait AlgorithmSettings {
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;
 
-    /// Sets what follows from the length of the run, in environment steps, if it is left open. Returns the key that was
-    /// set.
+    /// Fills in the key whose default depends on the length of the run, in environment steps, if it is not set. Returns
+    /// that key.
     fn set_from_length(&mut self, _steps: u64) -> Option<&'static str> {
         None
     }

@@ -13,8 +13,8 @@ section! {
             change: Change::Anytime;
         /// Episodes of an evaluation. Their start states are always the same.
         episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours", change: Change::Anytime;
-        /// A policy that seems better than the best one must also be better on this many times `episodes` other
-        /// episodes. 0: the first comparison decides.
+        /// A policy that beats the best one must also beat it on `confirm` × `episodes` other episodes. 0: the first
+        /// comparison decides.
         confirm: u32 = 2, bounds: from(0, 100), unit: "–", source: "ours", change: Change::Anytime;
         /// Environments that the evaluator steps at once; at most one for each episode of an evaluation.
         envs: u32 = 64, bounds: from(1, 64), unit: "environments", source: "ours", change: Change::Anytime;

@@ -62,8 +62,8 @@ impl ReplayConfig {
         self.updates_before + (counted as f64 * self.updates_per_step) as u64
     }
 
-    /// Whether a learner with this many updates is behind by more than the tolerance, so that it should take no more
-    /// than `rows` environment steps.
+    /// Whether a learner with `updates` updates lags behind `rows` environment steps by more than the tolerance, and so
+    /// should take no more of them.
     pub fn learner_is_behind(&self, rows: u64, updates: u64) -> bool {
         let rows = rows.saturating_sub(self.tolerance);
         rows > self.ratio_start() && self.allowed_updates(rows) > updates

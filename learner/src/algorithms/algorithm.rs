@@ -45,7 +45,7 @@ pub trait Algorithm {
     fn updates(&self) -> u64;
 
     /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It
-    /// is called while the rows allow more updates than that.
+    /// is called while the rows allow more updates than `updates`.
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses;
 
     /// Shares the work of updates among these threads from now on, if there is enough of it. The bits of the results do

@@ -37,8 +37,8 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
     learned.chain(statistics).collect()
 }
 
-/// The state of the algorithm `fresh`, except that the arrays `weights` are those of another one's state `saved`. The
-/// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
+/// The state of the algorithm `fresh` with the arrays `weights` of another one's state `saved`. The optimisers begin
+/// anew. The statistics of observations already include `rows` rows of its own replay.
 ///
 /// # Errors
 /// When the other state lacks a part, or has it in another shape.

@@ -1,5 +1,5 @@
-//! Soft actor-critic with a learned temperature: Haarnoja et al. 2018b, algorithm 1. As in widespread programs, ln α is
-//! learned instead of α, and its step comes first; the losses have α from before it.
+//! Soft actor-critic with a learned temperature: Haarnoja et al. 2018b, algorithm 1. As in common implementations, ln α
+//! is learned instead of α and updated first; the losses use α from before that step.
 //!
 //! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂ and their targets with a prime, temperature α,
 //! target entropy H̄. An action is a = tanh u, u = μ + σ ε, with ε standard normal. Actions within an update are scaled
@@ -234,8 +234,8 @@ impl Sac {
         self.temperature.alpha()
     }
 
-    /// Takes a gradient step with these standard normal numbers ε for the actions in s and in s', a column for each
-    /// sample. Returns the sum of the critics' losses, the actor's loss, and the mean of Q₁(s, a) before its step.
+    /// Makes one update with this standard normal noise ε for the actions in s and in s', a column for each sample.
+    /// Returns the sum of the critics' losses, the actor's loss, and the mean of Q₁(s, a) before its step.
     pub fn update(&mut self, batch: &Minibatch, noise: &DMatrix<f32>, next_noise: &DMatrix<f32>) -> Losses {
         self.now.noise.copy_from(noise);
         self.next.noise.copy_from(next_noise);

@@ -1,7 +1,7 @@
 //! Twin delayed deep deterministic policy gradient: algorithm 1 of Fujimoto et al. 2018.
 //!
-//! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂, their targets with a prime, noise ε ~
-//! clip(N(0, σ̃), −c, c), delay d. Actions within an update are scaled to [−1, 1].
+//! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂, their targets with a prime, standard normal noise
+//! ε, whose product with σ̃ is clipped to [−c, c], delay d. Actions within an update are scaled to [−1, 1].
 
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
@@ -86,7 +86,7 @@ impl Td3 {
         })
     }
 
-    /// Takes a gradient step with these standard normal numbers, a column for each sample. Returns the sum of the
+    /// Makes one update with this standard normal noise, a column for each sample. Returns the sum of the
     /// critics' losses, the loss of the actor's newest step, and the mean of Q₁(s, a) before its step.
     pub fn update(&mut self, batch: &Minibatch, noise: &DMatrix<f32>) -> Losses {
         let t = self.updates + 1;

@@ -1,5 +1,5 @@
 //! Two critics with their targets, as TD3 and SAC have them: Q₁ and Q₂ over (s, a), with a scaled to [−1, 1]. The
-//! smaller of their values is believed (clipped double Q-learning, Fujimoto et al. 2018, section 4.2).
+//! targets use the smaller of their values (clipped double Q-learning, Fujimoto et al. 2018, section 4.2).
 
 use nalgebra::{DMatrix, DVector};
 use shoal_common::network::{ActionRange, NetworkLayout};
@@ -124,7 +124,7 @@ impl TwinCritics {
 
     /// Minimises the sum over both critics of 1/N Σ (y − Q(s, a))² by one step, number `t`, where y = r + discount ·
     /// (min Q'(s', a') + `bonus`). `a_next` are the scaled actions a', `bonus` is a number for each sample. The targets
-    /// follow with τ, if it is given. A thread has one critic.
+    /// follow with τ, if it is given. Each of two threads updates one critic.
     pub(super) fn step(
         &mut self,
         threads: &Threads,

@@ -6,8 +6,8 @@ use super::adam::Adam;
 use super::aligned::Aligned;
 use super::threads::Threads;
 
-/// Two threads are used only if there are at least this many samples, and units in each hidden layer but the last (or
-/// in the only one). If a dimension is 1 or the product is small, faer adds the terms of a transposed product in
+/// Two threads are used only if there are at least this many samples, and this many units in each hidden layer except
+/// the last of several. If a dimension is 1 or the product is small, faer adds the terms of a transposed product in
 /// another order, and the bits must not depend on the number of threads.
 const MIN_SPLIT: usize = 4;
 /// As [`MIN_SPLIT`], for samples times units of each hidden layer but the first (or of the only one).

@@ -35,7 +35,8 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         learner.connect_new_actors()?;
         let updates = learner.updates();
-        // After the last episode no more rows are taken: a slow learner would never make all the updates of theirs.
+        // After the last episode no more rows are taken: a slow learner would never make all the updates that they
+        // allow.
         let drained = !learner.has_all_steps()
             // After a power loss the replay may have no readable row, although it had many. Then new rows come first.
             && learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {

@@ -290,7 +290,7 @@ fn reason(RunOutcome { state, reason, .. }: RunOutcome) -> Option<String> {
     match state {
         // Its launcher was killed: the reason only says what it was doing.
         RunState::Running => None,
-        RunState::Finished => Some(reason),
+        RunState::Finished => Some(reason.to_string()),
         RunState::Stopped => Some(format!("stopped ({reason})")),
         RunState::Failed => Some(format!("failed: {reason}")),
     }

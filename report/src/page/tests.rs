@@ -127,7 +127,7 @@ fn a_run_has_finished_although_the_last_report_of_its_learner_was_lost() {
     std::fs::write(run.learner_log(), learner).unwrap();
     for (state, shown) in [(RunState::Finished, "finished"), (RunState::Failed, "unfinished")] {
         let outcome = RunOutcome::new(state, steps, 4);
-        outcome.with_reason("the reason").write(&run).unwrap();
+        outcome.with_reason("the reason".to_owned()).write(&run).unwrap();
         let run = &data(&gather(std::slice::from_ref(&run), None).unwrap().page().unwrap())["runs"][0];
         assert_eq!((&run["state"], &run["env_steps"]), (&shown.into(), &steps.into()));
         assert!(run["why"].as_str().unwrap().contains("the reason"), "{run}");

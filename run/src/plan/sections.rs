@@ -17,7 +17,7 @@ use crate::external_environment::GYMNASIUM;
 use crate::plan::algorithm;
 use crate::usage::UsageError;
 
-/// The default name of a run of a preset or a file, its sections for the algorithm that is asked for.
+/// The default name of a run of a preset or a file, and its sections for the requested algorithm.
 pub(super) fn sections_for_algorithm(
     what: &str,
     overrides: &RunOverrides,
@@ -41,7 +41,7 @@ pub(super) fn sections_for_algorithm(
             name = format!("{name}-{algorithm}");
         }
     } else if let Some(other) = named.filter(|named| *named != algorithm) {
-        bail!("{what} is for {other}, but {algorithm} is asked for: remove what belongs to {other} from the file");
+        bail!("{what} is for {other}, but {algorithm} is requested: remove what belongs to {other} from the file");
     } else if named.is_none() && algorithm != default {
         let environment = table.get("environment").and_then(|section| section.get("name"));
         let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();

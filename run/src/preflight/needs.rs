@@ -26,14 +26,15 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
     let parameters = parameters(config);
     let of_an_actor = environment::reserved(spec, config.actors.envs as usize)
         + transitions::reserved(&config.chunk_layout(), config.actors.window);
-    // The actors and the evaluator, an environment server for each, and the learner.
-    let roles = 2 * (max + 1) + 1;
+    // The actors and the evaluator, an environment server for each, the learner, and the gate if other hosts may join.
+    let roles = 2 * (max + 1) + 2;
     actors * of_an_actor
         + environment::reserved(spec, config.evaluation_envs() as usize)
         + control::reserved(max)
         + policy::reserved(max, parameters)
         + reports::reserved::<Heartbeat>(max, roles)
-        + reports::reserved::<EpisodeReport>(max, max)
+        // The actors' and the gate's.
+        + reports::reserved::<EpisodeReport>(max, max + 1)
         + reports::reserved::<EvaluationReport>(max, 1)
         + reports::reserved::<EvaluatedPeriod>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)

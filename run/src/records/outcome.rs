@@ -1,26 +1,65 @@
 //! How a run ended: `outcome.json` in its directory, written atomically by its launcher.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 use shoal_common::run_dir::RunDir;
 use shoal_common::versioned_file::VersionedFile;
-
-/// The reason in the outcome of a run whose launcher answers no requests yet. Its state is `Running`.
-pub const STARTING: &str = "starting";
-
-/// The reason in the outcome of a run that evaluates its policies once more. Its state is still `Running`.
-pub const FINAL_EVALUATION: &str = "final evaluation";
 
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOutcome {
     /// The run's state.
     pub state: RunState,
-    /// Why it ended, if it did not finish.
-    pub reason: Option<String>,
+    /// Why it has no roles, if it is running, or why it did not finish.
+    pub reason: Option<OutcomeReason>,
     /// Environment steps that were learned from.
     pub steps: u64,
     /// Episodes that were learned from.
     pub episodes: u64,
+}
+
+/// Why a run is in its state. The file has it as text.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "String", into = "String")]
+pub enum OutcomeReason {
+    /// The launcher of a running run has no roles yet and answers no requests.
+    Starting,
+    /// The launcher of a running run evaluates its policies once more, without roles.
+    FinalEvaluation,
+    /// Any other reason, in words.
+    Other(String),
+}
+
+impl OutcomeReason {
+    const STARTING: &str = "starting";
+    const FINAL_EVALUATION: &str = "final evaluation";
+}
+
+impl fmt::Display for OutcomeReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Starting => Self::STARTING,
+            Self::FinalEvaluation => Self::FINAL_EVALUATION,
+            Self::Other(reason) => reason,
+        })
+    }
+}
+
+impl From<String> for OutcomeReason {
+    fn from(reason: String) -> Self {
+        match reason.as_str() {
+            Self::STARTING => Self::Starting,
+            Self::FINAL_EVALUATION => Self::FinalEvaluation,
+            _ => Self::Other(reason),
+        }
+    }
+}
+
+impl From<OutcomeReason> for String {
+    fn from(reason: OutcomeReason) -> Self {
+        reason.to_string()
+    }
 }
 
 /// The state of a run.
@@ -54,7 +93,7 @@ impl RunOutcome {
     }
 
     /// The same outcome with this reason.
-    pub fn with_reason(self, reason: impl Into<String>) -> Self {
+    pub fn with_reason(self, reason: impl Into<OutcomeReason>) -> Self {
         Self {
             reason: Some(reason.into()),
             ..self

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Change {
-    /// It may. What is learned from given rows does not depend on it.
+    /// It may change at any time: what is learned from given rows does not depend on it.
     Anytime,
-    /// It may. Later updates depend on it, so that a lockstep run must have learned from all its complete rounds.
+    /// It may change, but later updates depend on it: a lockstep run must have learned from all its complete rounds.
     Learning,
-    /// It may in a free run. In a lockstep run it may not, for this reason.
+    /// It may change in a free run. In a lockstep run it may not, for this reason.
     InFreeRuns(Cow<'static, str>),
     /// It is part of the shape of a network, and never changes. A run that begins with the networks of another run
     /// takes it from there.
@@ -33,7 +33,7 @@ pub const fn in_free_runs(why: &'static str) -> Change {
     Change::InFreeRuns(Cow::Borrowed(why))
 }
 
-/// How actors explore. In a lockstep run some actors may have collected their part of the next round already, and that
+/// For keys of exploration. In a lockstep run some actors may already have collected their part of the next round; that
 /// depends on timing.
 pub const EXPLORATION: Change =
     in_free_runs("a part of its next round may have been collected with the old value, and that depends on timing");

@@ -23,7 +23,8 @@ pub enum ControlRequest {
     Stop,
     /// From the gate: admit another host.
     Admit(HostRequest),
-    /// From the gate, a few times a second: how the other hosts are. The answer is which hosts are admitted.
+    /// From the gate, a few times a second: the status of the other hosts. The answer is which hosts are
+    /// admitted.
     Hosts(Vec<HostStatus>),
     /// From a relay: end this actor if it is of this incarnation or an earlier one, and start it again.
     Replace {
@@ -60,9 +61,9 @@ pub struct HostLease {
     pub epoch: u64,
     /// The indices of its actors.
     pub actors: Vec<u32>,
-    /// Its processes have incarnations from this one on …
+    /// The first incarnation of its processes.
     pub first_incarnation: u64,
-    /// … and below this one.
+    /// Their incarnations are below this one.
     pub limit: u64,
 }
 

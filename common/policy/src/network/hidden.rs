@@ -42,7 +42,7 @@ impl DerefMut for Layers {
     }
 }
 
-/// A list of an invalid length does not compile.
+/// An invalid length is a compile error.
 impl<const N: usize> From<[usize; N]> for Layers {
     fn from(list: [usize; N]) -> Self {
         const { assert!(1 <= N && N <= Layers::MAX, "1 to 8 layers") };
