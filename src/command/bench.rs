@@ -9,7 +9,8 @@ pub(crate) struct BenchArgs {
     /// What to measure.
     #[arg(value_enum)]
     pub(crate) stage: Stage,
-    /// With `actors`: the numbers of actors to measure [default: 1,2,4, … up to the number of cores].
+    /// With `actors`: the numbers of actors to measure [default: 1,2,4, … up to the number of cores, at least 4 and
+    /// at most 64].
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
     /// With `learner`: the algorithm to measure [default: ddpg].

@@ -57,7 +57,7 @@ fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
 
 const HEAD: &str = "\
 The keys of a configuration, for --set SECTION.KEY=VALUE or a FILE.toml. In brackets: the unit (– if there is none), and
-the source of the default: a place in the thesis, or ours.
+the source of the default: a place in the thesis, a paper or program, or ours.
 ";
 
 fn explain_all() -> anyhow::Result<String> {

@@ -19,7 +19,8 @@ pub(crate) struct ReproduceArgs {
     /// What to run [default: everything].
     #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(choices()))]
     pub(crate) experiments: Vec<String>,
-    /// Run seeds 1 to N of each experiment [default: 5; 10 to 30 for frozen-lake and cart-pole; 2 with --quick].
+    /// Run seeds 1 to N of each experiment [default: 5; 10 to 30 for frozen-lake and cart-pole; 3 to 10 for
+    /// methods; 2 with --quick].
     #[arg(long, value_name = "N", value_parser = parse_positive_count)]
     pub(crate) seeds: Option<u32>,
     /// Number of trainings at a time [default: half the cores, because each training keeps about two busy].

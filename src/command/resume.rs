@@ -92,8 +92,8 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     let here = args.run.display();
     if run.replay_removed().exists() && !run.replay_file().exists() {
         bail!(
-            "cannot resume {here}: `shoal rm --replay` has removed its replay, from which it would learn; eval, report \
-             and export still work, and `shoal train … --from {here}` begins a new run with its networks"
+            "cannot resume {here}: `shoal rm --replay` has removed its replay, from which it would learn; eval, report, \
+             plot and film still work, and `shoal train … --from {here}` begins a new run with its networks"
         );
     }
     if used.run.begins_with_others() && Origin::read(&run)?.is_none() {

@@ -110,7 +110,7 @@ impl Environment for Rail {
         Some(DT)
     }
 
-    /// The cart on its rail, for `shoal film` and the report; the arrow is the force.
+    /// The cart on its rail, for pictures of an episode; the arrow is the force.
     fn draw(&self, action: &[f64]) -> Option<Drawing> {
         let (x, force) = (self.x, action.first().copied().unwrap_or(0.0).clamp(-1.0, 1.0));
         let drawing = Drawing::new([-X - 0.4, -0.6], [X + 0.4, 0.9])

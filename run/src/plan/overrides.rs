@@ -24,7 +24,7 @@ pub struct RunOverrides {
     /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub run: Option<PathBuf>,
-    /// The algorithm [default: the preset's; for gym: the one that suits the spaces].
+    /// The algorithm [default: the preset's; for gym: the one that suits the environment].
     #[arg(long = "method", visible_alias = "algorithm", value_name = "ALGORITHM", value_parser = PossibleValuesParser::new(algorithm::names()))]
     pub algorithm: Option<String>,
     /// Seed of every random stream.
