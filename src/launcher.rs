@@ -376,7 +376,7 @@ impl<'a> Launcher<'a> {
                 self.progress.print(&slow);
             }
             // A learner that has just died is restarted first, so that it takes in what the actors have sent.
-            let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_RESTART;
+            let may_end = |asked: Instant| self.supervisor.learner_is_ready() || asked.elapsed() >= LEARNER_RESTART;
             if self.stop_requested_at.is_some_and(may_end) {
                 return Ok(RunEnd::Stopped);
             }

@@ -490,7 +490,7 @@ impl<'a> Actor<'a> {
     fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
         let index = self.settings.instance.index as usize;
         while self.sender.in_flight(self.commits.committed(index)) > most {
-            if self.stop.at_once() {
+            if self.stop.run_is_ending() {
                 let ending_since = self.ending_since.get_or_insert_with(Instant::now);
                 if !self.sender.has_receiver() || ending_since.elapsed() >= LAST_COMMIT_TIMEOUT {
                     return Ok(false);

@@ -58,7 +58,7 @@ impl EvaluatorSettings {
 /// Among many policies, some do well on a few episodes by chance. A candidate that seems better than the best must
 /// therefore be better on other episodes too. `confirm` returns the mean return on those, or `None` if nothing is to be
 /// confirmed.
-fn challenge<E>(
+fn better_of<E>(
     best: Option<Best>,
     mut candidate: Best,
     mut confirm: impl FnMut(&[f32]) -> Result<Option<f64>, E>,
@@ -198,7 +198,7 @@ impl<'a> Evaluator<'a> {
         let header = published.header();
         let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
-        let best = self.challenge_best(&published, return_mean)?;
+        let best = self.replace_if_better(&published, return_mean)?;
         if best {
             self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
         }
@@ -229,7 +229,7 @@ impl<'a> Evaluator<'a> {
 
     /// Compares this policy with the best one, with further episodes of both if it seems better, and keeps the better
     /// one. Returns whether that is this policy.
-    fn challenge_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
+    fn replace_if_better(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
             mean,
@@ -240,7 +240,7 @@ impl<'a> Evaluator<'a> {
         let first = evaluation.episodes;
         let episodes = first.saturating_mul(evaluation.confirm);
         let best = self.best.take();
-        let (best, replaced) = challenge(best, candidate, |parameters| -> Result<_, Exit<ActorError>> {
+        let (best, replaced) = better_of(best, candidate, |parameters| -> Result<_, Exit<ActorError>> {
             if episodes == 0 {
                 return Ok(None);
             }
@@ -394,7 +394,7 @@ mod tests {
             asked += 1;
             Ok::<_, Infallible>(Some(f64::from(parameters[0])))
         };
-        let Ok((best, replaced)) = challenge(best, candidate, confirm);
+        let Ok((best, replaced)) = better_of(best, candidate, confirm);
         (best.map(|best| best.version), replaced, asked)
     }
 
@@ -436,7 +436,7 @@ mod tests {
             (Some(2), true, 1),
             "known from before"
         );
-        let Ok((best, replaced)) = challenge(best(), policy(2, 6.0, 0.0), |_| Ok::<_, Infallible>(None));
+        let Ok((best, replaced)) = better_of(best(), policy(2, 6.0, 0.0), |_| Ok::<_, Infallible>(None));
         assert!(
             replaced && best.is_some_and(|best| best.version == 2),
             "nothing is confirmed"

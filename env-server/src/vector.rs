@@ -72,31 +72,31 @@ pub enum Reset<'a> {
 }
 
 impl VectorEnvironment {
-    /// Makes `count` (below 2²⁴) environments from `name` and `parameters`, for the server of this index and
-    /// incarnation. `reset` must be called before the first `step`.
+    /// Makes `count` (below 2²⁴) environments from `name` and `parameters`, for the server of this index.
+    /// `seed`, `server` and `stream` select the random streams of training episodes. `reset` must be called before the first `step`.
     pub fn new(
         name: &str,
         parameters: &toml::Table,
         count: u32,
         seed: u64,
         server: u64,
-        incarnation: u64,
+        stream: u64,
     ) -> Result<Self, EnvironmentError> {
-        Self::of(|| make(name, parameters), count, (seed, server, incarnation))
+        Self::of(|| make(name, parameters), count, (seed, server, stream))
     }
 
-    /// The same for environments that `make` makes, for the server of this `(seed, index, incarnation)`.
+    /// As [`new`](Self::new), for environments that `make` makes.
     ///
     /// # Errors
     /// When `make` fails.
     pub fn of<E>(
         make: impl Fn() -> Result<Box<dyn Environment>, E>,
         count: u32,
-        (seed, server, incarnation): (u64, u64, u64),
+        (seed, server, number): (u64, u64, u64),
     ) -> Result<Self, E> {
         let scratch = make()?;
         let spec = scratch.spec();
-        let training = stream(seed, Purpose::Environment, server, incarnation);
+        let training = stream(seed, Purpose::Environment, server, number);
         let running = |_| {
             let environment = make()?;
             Ok(Running {

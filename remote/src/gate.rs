@@ -249,7 +249,7 @@ impl<'a> Gate<'a> {
         if !self.stop.requested() {
             return false;
         }
-        if self.stop.at_once() {
+        if self.stop.run_is_ending() {
             return true;
         }
         let since = *self.over_since.get_or_insert_with(Instant::now);

@@ -78,7 +78,7 @@ pub(super) struct Supervisor {
     actors_with_services: BTreeSet<u32>,
     servers_with_services: BTreeSet<u32>,
     /// Whether the learner is on this host.
-    has_learner: bool,
+    is_learner_host: bool,
     window: u32,
     cleaning: Cleaning,
     /// The wanted actors of this host, in order.
@@ -133,7 +133,7 @@ impl Supervisor {
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
-        let has_learner = matches!(host, SupervisedHost::OfLearner { .. });
+        let is_learner_host = matches!(host, SupervisedHost::OfLearner { .. });
         let (children, actors) = match host {
             SupervisedHost::OfLearner { gate } => {
                 services.create_environment(domain, server)?;
@@ -153,7 +153,7 @@ impl Supervisor {
             services,
             actors_with_services: BTreeSet::new(),
             servers_with_services: BTreeSet::new(),
-            has_learner,
+            is_learner_host,
             window: config.actors.window,
             cleaning: Cleaning::new(),
             actors,
@@ -267,7 +267,7 @@ impl Supervisor {
     }
 
     /// Whether there is a learner that is ready.
-    pub(super) fn has_learner(&self) -> bool {
+    pub(super) fn learner_is_ready(&self) -> bool {
         let learner = self.learner();
         learner.is_some_and(|learner| learner.process.is_some() && learner.is_ready())
     }

@@ -42,10 +42,10 @@ pub enum PolicyError {
     DiscreteActionsRequired,
     /// A table needs discrete observations.
     #[error("it needs a discrete observation space, but these observations are real-valued (a box)")]
-    DiscreteStatesRequired,
+    DiscreteObservationsRequired,
     /// A network needs real-valued observations: it would use an index as a quantity.
     #[error("it needs real-valued observations (a box), but these are indices of {n} states")]
-    RealStatesRequired {
+    RealObservationsRequired {
         /// Number of states.
         n: u32,
     },
@@ -207,7 +207,7 @@ pub fn action_values(
 /// When they are indices.
 pub fn check_real_observations(spec: &EnvironmentSpec) -> Result<(), PolicyError> {
     match spec.observation {
-        Space::Discrete { n, .. } => Err(PolicyError::RealStatesRequired { n }),
+        Space::Discrete { n, .. } => Err(PolicyError::RealObservationsRequired { n }),
         Space::Box { .. } => Ok(()),
     }
 }
@@ -220,7 +220,7 @@ pub fn table(spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError
     let actions = counted_actions(spec)?;
     match spec.observation {
         Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
-        Space::Box { .. } => Err(PolicyError::DiscreteStatesRequired),
+        Space::Box { .. } => Err(PolicyError::DiscreteObservationsRequired),
     }
 }
 

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use shoal_base::section::{Change, never};
 use toml::{Table, Value};
 
-use super::environment::ITS_ROWS;
+use super::environment::CHANGES_ROWS;
 use super::{Config, explanation};
 
 /// A key with different values in two configurations of a run.
@@ -69,7 +69,7 @@ fn declared(sections: &[explanation::Section], key: &str) -> Change {
     let keys = sections.iter().filter(|known| known.name == section);
     let known = keys.flat_map(|section| &section.keys).find(|known| known.name == name);
     let declared = known.and_then(|known| known.change.clone());
-    declared.unwrap_or_else(|| never(ITS_ROWS))
+    declared.unwrap_or_else(|| never(CHANGES_ROWS))
 }
 
 /// Every key with its section and value.
@@ -181,6 +181,6 @@ mod tests {
         }
         let wind = parse("[environment]\nname = \"x\"\nwind = 1\n");
         let calm = parse("[environment]\nname = \"x\"\nwind = 0\n");
-        assert_eq!(wind.differences(&calm)[0].change, never(ITS_ROWS));
+        assert_eq!(wind.differences(&calm)[0].change, never(CHANGES_ROWS));
     }
 }

@@ -15,20 +15,20 @@ const MAX_WIDTH: usize = 4_096;
 const MAX_INDICES: u64 = 1 << 24;
 
 /// Why the environment of a run and its parameters never change.
-pub(super) const ITS_ROWS: &str = "the rows in the replay come from this environment";
+pub(super) const CHANGES_ROWS: &str = "the rows in the replay come from this environment";
 
 /// Why the command of an environment's server never changes.
-const ITS_SERVER: &str = "the rows in the replay come from it; if its program has moved, edit server.json";
+const CHANGES_SERVER: &str = "the rows in the replay come from it; if its program has moved, edit server.json";
 
 /// The environment: its name and its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct EnvironmentConfig {
     /// The name of a built-in environment, or a name for an external server, such as `gym:Pendulum-v1`.
-    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5", "change" = never(ITS_ROWS)))]
+    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5", "change" = never(CHANGES_ROWS)))]
     pub name: String,
     /// The command that starts the external environment server (`docs/PROTOCOL.md`); empty for built-in environments.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("unit" = "–", "source" = "ours", "change" = never(ITS_SERVER)))]
+    #[schemars(extend("unit" = "–", "source" = "ours", "change" = never(CHANGES_SERVER)))]
     pub server: Vec<String>,
     /// Invalid answers, such as an infinite reward, after which the run ends. Each one ends the episodes of its server,
     /// and new ones begin.

@@ -66,7 +66,7 @@ impl Ddpg {
         Ok(Self {
             range,
             tau: settings.tau as f32,
-            threads: Threads::ALONE,
+            threads: Threads::SINGLE,
             updates: 0,
             // Lines 1 and 2: θ at random, θ' ← θ.
             actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &initialise(&mu, seed, 0)),

@@ -52,7 +52,7 @@ impl Dqn {
         let layout = settings.network(spec);
         policy::action_values(layout, settings.dueling, spec, 0)?;
         Ok(Self {
-            threads: Threads::ALONE,
+            threads: Threads::SINGLE,
             updates: 0,
             network: NetworkWithTarget::new(layout, settings.learning_rate, &fan_in(&layout, seed, 0)),
             q: Pass::new(layout, batch),

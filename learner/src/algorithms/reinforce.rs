@@ -55,13 +55,13 @@ impl NetworkWithPass {
     fn descend(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
         self.pass.backward(
-            &Threads::ALONE,
+            &Threads::SINGLE,
             &self.network.parameters,
             s.as_slice(),
             &self.d,
             &mut self.network.gradient,
         );
-        self.network.descend(&Threads::ALONE, t);
+        self.network.descend(&Threads::SINGLE, t);
     }
 }
 

@@ -175,7 +175,7 @@ impl Temperature {
     /// Takes step number `t` against the gradient of −1/N Σ ln α · (ln π(a|s) + H̄).
     fn descend(&mut self, t: u64, log_pi: &DVector<f32>) {
         let gradient = [-mean(log_pi.iter().map(|log_pi| log_pi + self.target_entropy))];
-        self.adam.step(&Threads::ALONE, t, &gradient, &mut self.log_alpha);
+        self.adam.step(&Threads::SINGLE, t, &gradient, &mut self.log_alpha);
     }
 }
 
@@ -212,7 +212,7 @@ impl Sac {
         Ok(Self {
             range,
             tau: settings.tau as f32,
-            threads: Threads::ALONE,
+            threads: Threads::SINGLE,
             updates: 0,
             actor: TrainableNetwork::new(pi, settings.actor_learning_rate, &fan_in(&pi, seed, 0)),
             critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),

@@ -69,7 +69,7 @@ impl Td3 {
         let ActorCritic { actor: mu, critic: q } = settings.networks(spec);
         let (action, batch) = (range.width(), settings.batch);
         Ok(Self {
-            threads: Threads::ALONE,
+            threads: Threads::SINGLE,
             updates: 0,
             actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &fan_in(&mu, seed, 0)),
             critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),

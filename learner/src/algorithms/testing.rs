@@ -120,5 +120,5 @@ pub(super) fn assert_threads_do_not_change_the_bits<A: MinibatchAlgorithm>(
     };
     // A thread can start a second one only once.
     let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two_threads().unwrap())).join().unwrap());
-    assert_eq!(shared, run(Threads::ALONE), "{what}");
+    assert_eq!(shared, run(Threads::SINGLE), "{what}");
 }

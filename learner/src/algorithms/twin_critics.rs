@@ -161,10 +161,10 @@ impl TwinCritics {
                 *d = scale * (q - y);
             }
             let online = &mut network.online;
-            q.backward(&Threads::ALONE, &online.parameters, s, d_q, &mut online.gradient);
+            q.backward(&Threads::SINGLE, &online.parameters, s, d_q, &mut online.gradient);
             match tau {
-                Some(tau) => network.step_with_target(&Threads::ALONE, t, tau),
-                None => network.online.descend(&Threads::ALONE, t),
+                Some(tau) => network.step_with_target(&Threads::SINGLE, t, tau),
+                None => network.online.descend(&Threads::SINGLE, t),
             }
         };
         threads.both(|| descend(first), || descend(second));

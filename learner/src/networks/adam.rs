@@ -164,7 +164,7 @@ mod tests {
             let gradient: Vec<f32> = (0..count)
                 .map(|i| ((t as f32 * 0.37 + i as f32).sin() + 0.2) * 10f32.powi(i as i32 % 9 - 6))
                 .collect();
-            adam.step_with_target(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
+            adam.step_with_target(&Threads::SINGLE, t, &gradient, &mut weights, 0.01, &mut targets);
             for i in 0..count {
                 expected[i] = references[i].step(1e-3, gradient[i].into(), expected[i]);
                 expected_targets[i] = 0.01 * expected[i] + 0.99 * expected_targets[i];
@@ -186,8 +186,8 @@ mod tests {
         let (mut weights, mut same, mut target) = ([0.5_f32; 3], [0.5_f32; 3], [0.0_f32; 3]);
         for t in 1..=20 {
             let gradient = [0.3, -0.1 * t as f32, 0.0];
-            without.step(&Threads::ALONE, t, &gradient, &mut weights);
-            with.step_with_target(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
+            without.step(&Threads::SINGLE, t, &gradient, &mut weights);
+            with.step_with_target(&Threads::SINGLE, t, &gradient, &mut same, 0.1, &mut target);
         }
         assert_eq!(weights, same);
         assert_ne!(weights[..2], [0.5; 2]);
@@ -197,10 +197,10 @@ mod tests {
     fn moments_without_gradient_end_at_zero_and_are_never_denormal() {
         let mut adam = Adam::new(1e-3, 20);
         let (mut weights, mut targets) = (vec![0.0; 20], vec![0.0; 20]);
-        adam.step_with_target(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
+        adam.step_with_target(&Threads::SINGLE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
         for t in 2..=30_000 {
             adam.step_with_target(
-                &Threads::ALONE,
+                &Threads::SINGLE,
                 t,
                 &[if t < 500 { 1e-22 } else { 0.0 }; 20],
                 &mut weights,

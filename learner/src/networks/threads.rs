@@ -17,7 +17,7 @@ pub struct ThreadsError(#[from] rayon::ThreadPoolBuildError);
 
 impl Threads {
     /// The calling thread alone.
-    pub const ALONE: Self = Self(None);
+    pub const SINGLE: Self = Self(None);
 
     /// The calling thread and a new one. A thread can call this only once.
     ///

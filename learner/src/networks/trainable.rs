@@ -22,7 +22,7 @@ pub fn threads_for(layout: &NetworkLayout, batch: usize, threads: Threads) -> Th
     let enough = batch >= MIN_SPLIT
         && all_but_last.iter().all(|units| *units >= MIN_SPLIT)
         && all_but_first.iter().all(|units| units * batch >= MIN_WORK);
-    if enough { threads } else { Threads::ALONE }
+    if enough { threads } else { Threads::SINGLE }
 }
 
 /// A network that learns.

@@ -73,7 +73,7 @@ impl Supervisor {
         }
         match self.actors.iter().max().copied() {
             // The learner opens those of all actors up to the last one.
-            Some(last) if self.has_learner => self.create_transitions(domain, 0..=last),
+            Some(last) if self.is_learner_host => self.create_transitions(domain, 0..=last),
             _ => self.create_transitions(domain, self.actors.clone()),
         }
     }

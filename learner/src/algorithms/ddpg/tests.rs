@@ -230,7 +230,7 @@ fn two_threads_compute_the_same_bits_as_one() {
         };
         // A thread can start a second one only once.
         let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two_threads().unwrap())).join().unwrap());
-        assert_eq!(shared, run(Threads::ALONE), "{hidden:?}, batch {size}");
+        assert_eq!(shared, run(Threads::SINGLE), "{hidden:?}, batch {size}");
     }
 }
 
