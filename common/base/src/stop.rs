@@ -61,7 +61,7 @@ impl Stop {
     }
 
     /// Whether the whole run is ending, so that the role must not wait for long.
-    pub fn at_once(&self) -> bool {
+    pub fn run_is_ending(&self) -> bool {
         self.0.load(Ordering::Relaxed) >= END
     }
 
