@@ -23,7 +23,7 @@ pub enum IntakeError {
         cause: ChunkError,
     },
     /// A row holds a number that no environment or policy may give.
-    #[error("a row of actor {actor} is left out: its number {number} is {value}")]
+    #[error("actor {actor} sent a row that cannot be learned from: its number {number} is {value}")]
     NotFinite {
         /// Who sent it.
         actor: usize,
