@@ -103,19 +103,19 @@ impl RunClient {
     /// launcher has roles and should have answered.
     fn without_roles(&self, error: &ControlError) -> anyhow::Result<Option<RunStatus>> {
         let waiting = match self.reason_for_no_roles()? {
-            Some(reason) => reason,
+            Some(reason) => reason.to_string(),
             None if matches!(error, ControlError::Silence) => return Ok(None),
             None => match RunOutcome::read(&self.run)?.map(|outcome| outcome.state) {
-                None | Some(RunState::Running) => OutcomeReason::Starting,
-                Some(_) => OutcomeReason::Other("starting or ending".into()),
+                None | Some(RunState::Running) => OutcomeReason::Starting.to_string(),
+                Some(_) => "starting or ending".to_owned(),
             },
         };
-        self.saved(&waiting).map(Some)
+        self.saved(waiting).map(Some)
     }
 
-    fn saved(&self, waiting: &OutcomeReason) -> anyhow::Result<RunStatus> {
+    fn saved(&self, waiting: String) -> anyhow::Result<RunStatus> {
         Ok(RunStatus {
-            waiting: Some(waiting.to_string()),
+            waiting: Some(waiting),
             ..saved_status(&self.run.config()?, &self.run)?
         })
     }
@@ -125,7 +125,9 @@ impl RunClient {
         // A launcher that fails while it starts removes its shared memory, and this request with it.
         let starts = self.reason_for_no_roles()? == Some(OutcomeReason::Starting);
         let answer = match self.ask(ControlRequest::Status, PATIENCE) {
-            Err(_) if starts => Some(ControlResponse::Status(self.saved(&OutcomeReason::Starting)?)),
+            Err(_) if starts => Some(ControlResponse::Status(
+                self.saved(OutcomeReason::Starting.to_string())?,
+            )),
             answer => answer?,
         };
         match answer {
@@ -187,8 +189,8 @@ impl RunClient {
 
 /// Whether the launcher evaluates the run's policies once more.
 pub fn is_in_final_evaluation(status: &RunStatus) -> bool {
-    let final_evaluation = OutcomeReason::FinalEvaluation.to_string();
-    status.waiting == Some(final_evaluation)
+    let waiting = status.waiting.clone().map(OutcomeReason::from);
+    waiting == Some(OutcomeReason::FinalEvaluation)
 }
 
 fn accepted(answer: ControlResponse) -> anyhow::Result<()> {

@@ -20,8 +20,8 @@ pub struct PreparedFile {
 
 impl PreparedFile {
     /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new`
-    /// appended; a file that a killed process left there is overwritten. If another process is
-    /// writing that file, this one gets a unique name.
+    /// appended; a file that a killed process left there is overwritten. If another process is writing that
+    /// file, this one gets a unique name.
     pub fn write<E: From<io::Error>>(
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,

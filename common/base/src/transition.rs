@@ -34,8 +34,8 @@ pub struct Transition<'a> {
     pub discount: f32,
     /// Observation `s'` after the step.
     pub s_next: &'a [f32],
-    /// Whether the episode ended with this step, terminated or truncated. In a row of several steps: with the
-    /// first of them.
+    /// Whether the episode ended with this step, terminated or truncated. In a row of several steps: with the first
+    /// of them.
     pub last: bool,
 }
 

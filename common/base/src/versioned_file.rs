@@ -54,8 +54,8 @@ pub trait VersionedFile: Serialize + DeserializeOwned {
         }
     }
 
-    /// Reads the text of a file that messages call `path`. The format is checked first: a file of
-    /// another format may lack the other keys.
+    /// Reads the text of a file that messages call `path`. The format is checked first: a file of another format
+    /// may lack the other keys.
     ///
     /// # Errors
     /// When it is damaged or has another format.

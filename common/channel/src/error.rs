@@ -128,7 +128,7 @@ pub enum PeerError {
     /// The environment server refused a request.
     #[error("the environment server refused the request")]
     Refused,
-    /// The environment server denies having begun the episodes that it has begun.
+    /// The environment server says that its episodes have not begun, although they have.
     #[error(
         "the environment server says that its episodes have not begun, although they have: it violates the protocol"
     )]

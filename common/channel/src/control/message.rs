@@ -23,8 +23,7 @@ pub enum ControlRequest {
     Stop,
     /// From the gate: admit another host.
     Admit(HostRequest),
-    /// From the gate, a few times a second: the status of the other hosts. The answer is which hosts are
-    /// admitted.
+    /// From the gate, a few times a second: the status of the other hosts. The answer is the admitted hosts.
     Hosts(Vec<HostStatus>),
     /// From a relay: end this actor if it is of this incarnation or an earlier one, and start it again.
     Replace {
