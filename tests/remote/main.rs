@@ -553,7 +553,7 @@ fn template(place: &Workplace, name: &str, replaced: (&str, &str)) -> std::path:
 fn the_script_for_slurm_trains_joins_and_resumes() {
     let place = Workplace::new();
     let quick = place.path().join("quick.toml");
-    let text = "[environment]\nname = \"pendulum\"\n[run]\nsteps = 300000\n[ddpg]\nhidden = [24, 16]\n\
+    let text = "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [24, 16]\n\
                 [replay]\nwarmup = 64\ncapacity = 5000\n[evaluation]\nepisodes = 2\nfinal_episodes = 3\n";
     std::fs::write(&quick, text).unwrap();
     let script = template(&place, "slurm", ("what=pendulum", &format!("what={}", quick.display())));
@@ -572,18 +572,33 @@ fn the_script_for_slurm_trains_joins_and_resumes() {
         command.env("TMPDIR", place.path());
         command
     };
-    // The array may start before the learner.
-    let actors = job("actors").spawn().unwrap();
-    let learner = job("learner").spawn().unwrap();
-    for mut job in [learner, actors] {
-        until("the job has ended", || job.try_wait().unwrap().is_some());
-        assert!(job.wait().unwrap().success());
+    let run = place.path().join("run");
+    let rows = || {
+        let commits = shoal_common::commit::CommitReader::open(&run.join("replay.bin"));
+        commits.map_or([0; 3], |commits| [0, 2, 3].map(|actor| commits.actor(actor).rows))
+    };
+    // The array may start before the learner. The second round is that of jobs that are requeued during the run.
+    for _ in 0..2 {
+        let before = rows();
+        let actors = job("actors").spawn().unwrap();
+        let learner = job("learner").spawn().unwrap();
+        until("every actor has more rows in the replay", || {
+            rows().iter().zip(before).all(|(now, before)| *now > before)
+        });
+        let stopped = place.output(&["stop", "run"]);
+        assert!(stopped.status.success(), "{}", error_line(&stopped));
+        for mut job in [learner, actors] {
+            until("the job has ended", || job.try_wait().unwrap().is_some());
+            assert!(job.wait().unwrap().success());
+        }
     }
-    assert!(
-        [0, 2, 3]
-            .iter()
-            .all(|actor| committed(&place.path().join("run"), *actor) > 0)
-    );
+    let steps =
+        support::parse(&String::from_utf8(place.output(&["status", "run", "--json"]).stdout).unwrap())["env_steps"]
+            .as_u64()
+            .unwrap();
+    let last = format!("run.steps={}", steps + 100);
+    let finished = place.output(&["resume", "run", "--set", &last, "--quiet"]);
+    assert!(finished.status.success(), "{}", error_line(&finished));
     // Jobs that are requeued after the end find nothing left to do.
     assert!(support::output_of(&mut job("actors")).status.success());
     let again = support::output_of(&mut job("learner"));
