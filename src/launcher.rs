@@ -54,10 +54,12 @@ const LOW_FILL: f64 = 0.1;
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
 const LAST_EVALUATION_REPORT: Duration = Duration::from_secs(1);
 
-/// How long to wait for a learner that is being restarted when the run is asked to stop.
-const LEARNER_RESTART: Duration = Duration::from_secs(5);
+/// How long to wait for a learner, or a relay, that is being restarted when the run is requested to end.
+const RESTART: Duration = Duration::from_secs(5);
 
-/// How long actors may take to send their last chunks.
+/// How long actors of a run that is stopped wait until everything is committed, even while there is no learner.
+const ACTORS_HAND_OVER: Duration = Duration::from_secs(2);
+/// How long actors may take then, or in another run, to send their last chunks.
 const ACTORS_END: Duration = Duration::from_secs(3);
 /// How long the other roles may take to end. The learner saves its state in this time.
 const OTHERS_END: Duration = Duration::from_secs(15);
@@ -205,6 +207,20 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     }
 }
 
+/// A request to end the run.
+#[derive(Clone, Copy, Debug)]
+struct EndRequest {
+    at: Instant,
+    ending: RunEnd,
+}
+
+impl EndRequest {
+    fn new(ending: RunEnd) -> Self {
+        let at = Instant::now();
+        Self { at, ending }
+    }
+}
+
 struct Launcher<'a> {
     config: Config,
     run: &'a RunDir,
@@ -213,8 +229,8 @@ struct Launcher<'a> {
     control: ControlPort,
     /// The run's status when this launcher started.
     initial: RunStatus,
-    /// When the end was first requested.
-    stop_requested_at: Option<Instant>,
+    /// The first request to end the run.
+    end_request: Option<EndRequest>,
     /// Whether the roles are being ended.
     ending: bool,
     supervisor: Supervisor,
@@ -254,7 +270,7 @@ impl<'a> Launcher<'a> {
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
-            stop_requested_at: None,
+            end_request: None,
             ending: false,
             run,
             lock,
@@ -283,12 +299,11 @@ impl<'a> Launcher<'a> {
         }
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
-        let ended = self.end_all(matches!(
-            ending,
-            Ok(RunEnd::Finished | RunEnd::Stopped | RunEnd::Interrupted(_))
-        ));
-        if matches!(ending, Ok(RunEnd::Renewed)) && self.stop_requested_at.is_some() {
-            ending = Ok(RunEnd::Stopped);
+        let ended = self.end_all(ending.as_ref().ok().copied());
+        if matches!(ending, Ok(RunEnd::Renewed))
+            && let Some(request) = self.end_request
+        {
+            ending = Ok(request.ending);
         }
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
@@ -339,10 +354,12 @@ impl<'a> Launcher<'a> {
     fn watch(&mut self) -> anyhow::Result<RunEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
-            if let Some(signal) = self.signals.received() {
+            if let Some(signal) = self.signals.received()
+                && self.end_request.is_none()
+            {
                 self.log
                     .note("launcher", &format!("{} ends the run", signals::describe(signal)));
-                return Ok(RunEnd::Interrupted(signal));
+                self.end_request = Some(EndRequest::new(RunEnd::Interrupted(signal)));
             }
             self.lock.check(self.run)?;
             self.read_reports()?;
@@ -354,7 +371,7 @@ impl<'a> Launcher<'a> {
                     return Ok(RunEnd::Finished);
                 }
                 supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
-                    if self.stop_requested_at.is_some() => {}
+                    if self.end_request.is_some() => {}
                 supervisor::RunCondition::SharedMemoryOccupied => {
                     return Ok(self.renew("dead processes occupy shared memory for good"));
                 }
@@ -376,9 +393,10 @@ impl<'a> Launcher<'a> {
                 self.progress.print(&slow);
             }
             // A learner that has just died is restarted first, so that it takes in what the actors have sent.
-            let may_end = |asked: Instant| self.supervisor.learner_is_ready() || asked.elapsed() >= LEARNER_RESTART;
-            if self.stop_requested_at.is_some_and(may_end) {
-                return Ok(RunEnd::Stopped);
+            if let Some(EndRequest { at, ending }) = self.end_request
+                && (self.supervisor.is_ready(Role::Learner) || at.elapsed() >= RESTART)
+            {
+                return Ok(ending);
             }
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.time_to_next_task()));
@@ -409,25 +427,38 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over,
-    /// the other hosts are told so. Otherwise they are told nothing, and wait.
-    fn end_all(&mut self, is_over: bool) -> anyhow::Result<()> {
+    /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over, or is
+    /// requested to end meanwhile, the other hosts are told so. Otherwise they are told nothing, and wait.
+    fn end_all(&mut self, ending: Option<RunEnd>) -> anyhow::Result<()> {
         self.ending = true;
-        self.end(|role| role == Role::Actor, ACTORS_END);
-        if is_over {
-            // They hand over what they have while the learner is still there. A gate that has just died must tell them too.
-            self.supervisor.ensure_gate()?;
-            self.supervisor.ask_to_retire(Role::Gate);
-            self.await_end(|role| role == Role::Gate, GATE_END);
+        let was_asked = matches!(ending, Some(RunEnd::Stopped | RunEnd::Interrupted(_)));
+        let receiver = was_asked.then_some(Role::Learner);
+        if was_asked {
+            self.supervisor.ask_to_retire(Role::Actor);
+            self.have_ended_within(ACTORS_HAND_OVER, |role| role == Role::Actor, receiver);
         }
-        self.end(|_| true, OTHERS_END);
+        self.supervisor.ask_to_end(|role| role == Role::Actor);
+        self.await_end(|role| role == Role::Actor, ACTORS_END, receiver);
+        let are_told = was_asked || ending == Some(RunEnd::Finished) || self.end_request.is_some();
+        if are_told {
+            // They hand over what they have while the learner is still there.
+            self.tell_hosts(receiver)?;
+        }
+        self.supervisor.ask_to_end(|_| true);
+        self.await_end(|_| true, OTHERS_END, None);
+        if !are_told && self.end_request.is_some() {
+            self.tell_hosts(None)?;
+        }
         self.read_reports()?;
         self.supervisor.check_saved()
     }
 
-    fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        self.supervisor.ask_to_end(which);
-        self.await_end(which, patience);
+    /// Tells the other hosts that the run is over. A gate that has just died is started again for that.
+    fn tell_hosts(&mut self, receiver: Option<Role>) -> anyhow::Result<()> {
+        self.supervisor.ensure_gate(self.domain)?;
+        self.supervisor.ask_to_retire(Role::Gate);
+        self.await_end(|role| role == Role::Gate, GATE_END, receiver);
+        Ok(())
     }
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
@@ -464,8 +495,8 @@ impl<'a> Launcher<'a> {
 }
 
 impl EndRoles for Launcher<'_> {
-    fn supervisor(&mut self) -> &mut Supervisor {
-        &mut self.supervisor
+    fn parts(&mut self) -> (&mut Supervisor, &Domain) {
+        (&mut self.supervisor, self.domain)
     }
 
     /// A request to stop is answered when the run has ended.
@@ -479,7 +510,7 @@ impl EndRoles for Launcher<'_> {
             progress,
             initial,
             ending,
-            stop_requested_at,
+            end_request,
             log,
             domain,
             ..
@@ -499,7 +530,7 @@ impl EndRoles for Launcher<'_> {
                         Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
                     ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
-                    ControlRequest::Admit(_) if *ending || stop_requested_at.is_some() => {
+                    ControlRequest::Admit(_) if *ending || end_request.is_some() => {
                         Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
@@ -508,10 +539,10 @@ impl EndRoles for Launcher<'_> {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
                     }
                     ControlRequest::Stop => {
-                        if stop_requested_at.is_none() {
+                        if end_request.is_none() {
                             log.note("launcher", "`shoal stop` ends the run");
                         }
-                        stop_requested_at.get_or_insert_with(Instant::now);
+                        end_request.get_or_insert_with(|| EndRequest::new(RunEnd::Stopped));
                         Ok(None)
                     }
                 }

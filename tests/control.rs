@@ -7,6 +7,7 @@ mod support;
 use std::io::BufRead;
 use std::process::{Command, Output, Stdio};
 
+use rustix::process::Signal;
 use serde_json::Value;
 use support::{Workplace, json, parse, until};
 
@@ -188,6 +189,22 @@ fn a_learner_killed_just_before_a_stop_is_replaced_before_the_run_ends() {
     assert!(stopped.status.success(), "{}", stderr(&stopped));
     let run = running.run.clone();
     running.wait();
+    support::assert_all_rows_committed(&run, 2);
+}
+
+#[test]
+fn a_learner_killed_just_before_a_signal_is_replaced_before_the_run_ends() {
+    let place = Workplace::logging_chunks();
+    let running = place.start("run", &ENDLESS);
+    running.wait_for_learning();
+    // The launcher learns of the death and of the signal at the same time, in either order.
+    running.signal(Signal::STOP);
+    running.kill("learner-0");
+    running.signal(Signal::TERM);
+    running.signal(Signal::CONT);
+    let run = running.run.clone();
+    let (code, ..) = running.wait();
+    assert_eq!(code, Some(128 + 15), "{}", place.stderr());
     support::assert_all_rows_committed(&run, 2);
 }
 

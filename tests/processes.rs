@@ -4,7 +4,6 @@
 
 mod support;
 
-use std::path::PathBuf;
 use std::process::Command;
 
 use rustix::process::Signal;
@@ -249,46 +248,12 @@ fn a_role_that_keeps_failing_is_given_up_and_its_error_is_reported() {
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
-/// iceoryx2's files for a process of the run: the directory of its node, and the files that show whether it is alive.
-fn node_of(pid: i32) -> Vec<PathBuf> {
-    let open = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
-    let mut open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
-    let details = open
-        .find(|file| file.to_string_lossy().ends_with("node.details"))
-        .unwrap();
-    let directory = details.parent().unwrap();
-    let id = directory.file_name().unwrap().to_string_lossy().into_owned();
-    let nodes = std::fs::read_dir(directory.parent().unwrap()).unwrap().flatten();
-    nodes
-        .map(|entry| entry.path())
-        .filter(|path| path.to_string_lossy().contains(&id))
-        .collect()
-}
-
 #[test]
 fn a_run_whose_shared_memory_cannot_be_cleaned_up_continues_in_new_shared_memory() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "100000000"]);
     running.wait_for_learning();
-    let actor = *running.pids("actor-0").last().unwrap();
-    let node = node_of(actor);
-    assert!(node.len() > 1, "{node:?}");
-    // The launcher must find the actor dead, and the files that it needs for the cleanup gone.
-    running.signal(Signal::STOP);
-    running.kill("actor-0");
-    until("the actor is dead", || {
-        let stat = std::fs::read_to_string(format!("/proc/{actor}/stat")).unwrap_or_default();
-        stat.contains(") Z ")
-    });
-    for path in node {
-        let removed = if path.is_dir() {
-            std::fs::remove_dir_all(&path)
-        } else {
-            std::fs::remove_file(&path)
-        };
-        removed.unwrap();
-    }
-    running.signal(Signal::CONT);
+    running.kill_beyond_cleaning("actor-0");
     until("new shared memory is reported", || {
         running.log().contains("continues in new shared memory")
     });

@@ -55,7 +55,8 @@ pub(super) struct Child {
     longest_failed_start: Duration,
     /// The last heartbeat of the current process, with its time of arrival.
     last_heartbeat: Option<(Instant, Heartbeat)>,
-    /// When the process last made progress: started, took steps, got another policy, or changed its activity.
+    /// When the process last made progress: started, took steps, got another policy, changed its activity, or continued
+    /// after a silence.
     pub(super) progress_at: Instant,
     /// How often the process was replaced for lack of progress since it last took steps.
     pub(super) stalls: u32,
@@ -131,6 +132,7 @@ impl Child {
     /// Assigns the role to a new process.
     pub(super) fn begin(&mut self, process: Process) {
         self.process = Some(process);
+        self.ended = None;
         self.is_retiring = false;
         self.begin_at(Instant::now());
     }
@@ -164,10 +166,13 @@ impl Child {
 
     fn record_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
         self.reported_slow = false;
-        let before = self.last_heartbeat.replace((now, *heartbeat)).map(|(_, before)| before);
+        let before = self.last_heartbeat.replace((now, *heartbeat));
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
-        if before.is_none_or(|before| position(&before) != position(heartbeat)) {
+        // A process that was stopped could not make progress until now.
+        let is_progress =
+            |(then, before): (Instant, Heartbeat)| now - then >= SILENT || position(&before) != position(heartbeat);
+        if before.is_none_or(is_progress) {
             self.progress_at = now;
         }
         if heartbeat.steps > 0 {
@@ -398,6 +403,20 @@ mod tests {
     const READY: Duration = Duration::from_millis(20);
 
     const GIVE_UP_AFTER: Duration = Duration::from_secs(30);
+
+    #[test]
+    fn a_process_that_continues_after_a_silence_has_not_been_idle() {
+        let mut child = Simulation::new(Role::Evaluator);
+        let begun = child.now;
+        child.child.begin_at(begun);
+        let waiting = child.heartbeat(Activity::WaitingForPeer, 5);
+        let mut record = |second| {
+            child.child.record_at(&waiting, begun + Duration::from_secs(second));
+            (child.child.progress_at - begun).as_secs()
+        };
+        assert_eq!([record(1), record(2), record(4)], [1, 1, 1], "it waits");
+        assert_eq!([record(64), record(65)], [64, 64], "it was stopped for a minute");
+    }
 
     #[test]
     fn a_role_that_always_fails_is_given_up_after_half_a_minute_of_growing_pauses() {

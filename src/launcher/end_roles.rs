@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use shoal_common::channel::Domain;
 use shoal_common::role::Role;
 
 use super::supervisor::Supervisor;
@@ -11,8 +12,8 @@ const REAP_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A launcher, for ending its roles.
 pub(super) trait EndRoles {
-    /// The processes of the roles.
-    fn supervisor(&mut self) -> &mut Supervisor;
+    /// The processes of the roles, and where they find each other.
+    fn parts(&mut self) -> (&mut Supervisor, &Domain);
 
     /// Answers requests from other terminals.
     fn answer_requests(&mut self) -> anyhow::Result<()>;
@@ -21,12 +22,31 @@ pub(super) trait EndRoles {
     fn sleep(&mut self, most: Duration);
 
     /// Waits until processes have ended that were asked to, and kills them after `patience`.
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
+    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration, receiver: Option<Role>) {
+        if !self.have_ended_within(patience, which, receiver) {
+            self.parts().0.kill(which);
+        }
+    }
+
+    /// Waits at most `patience` until processes have ended that were asked to. If the `receiver` of what they send dies
+    /// meanwhile, it is started again, once. Returns whether they have ended.
+    fn have_ended_within(
+        &mut self,
+        patience: Duration,
+        which: impl Fn(Role) -> bool,
+        mut receiver: Option<Role>,
+    ) -> bool {
         let deadline = Instant::now() + patience;
-        while !self.supervisor().reap(which) {
-            if Instant::now() >= deadline {
-                self.supervisor().kill(which);
+        loop {
+            let (supervisor, domain) = self.parts();
+            if supervisor.reap(&which) {
+                return true;
             }
+            if Instant::now() >= deadline {
+                return false;
+            }
+            // If it cannot be started, the run must end all the same.
+            receiver = receiver.filter(|role| matches!(supervisor.start_again_if_dead(*role, domain), Ok(false)));
             // An error here must not prevent the end.
             let _ = self.answer_requests();
             self.sleep(deadline.saturating_duration_since(Instant::now()).min(REAP_INTERVAL));

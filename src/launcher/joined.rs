@@ -18,7 +18,7 @@ use super::end_roles::EndRoles;
 use super::log::Log;
 use super::stall::StallDetector;
 use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
-use super::{OTHERS_END, write_iox_config};
+use super::{OTHERS_END, RESTART, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
 const TICK: Duration = Duration::from_millis(100);
@@ -72,7 +72,8 @@ struct JoinedLauncher<'a> {
     stalls: StallDetector,
     log: Log,
     heartbeats: Reports<Heartbeat>,
-    stop_requested: bool,
+    /// The first request to end the work, with its time.
+    end_request: Option<(Instant, JoinEnd)>,
     has_lost_actors: bool,
     /// Since when the relay has had no connection.
     cut_off_since: Option<Instant>,
@@ -101,7 +102,7 @@ impl<'a> JoinedLauncher<'a> {
             signals,
             log,
             config,
-            stop_requested: false,
+            end_request: None,
             has_lost_actors: false,
             cut_off_since: None,
         })
@@ -117,9 +118,10 @@ impl<'a> JoinedLauncher<'a> {
             }
             _ => self.supervisor.ask_to_retire(Role::Actor),
         }
-        self.await_end(|role| role == Role::Actor, HAND_OVER);
+        let was_asked = matches!(ending, Ok(JoinEnd::Stopped | JoinEnd::Interrupted(_)));
+        self.await_end(|role| role == Role::Actor, HAND_OVER, was_asked.then_some(Role::Relay));
         self.supervisor.ask_to_end(|_| true);
-        self.await_end(|_| true, OTHERS_END);
+        self.await_end(|_| true, OTHERS_END, None);
         self.control.answer_waiting(&ControlResponse::Accepted);
         if let Err(error) = &ending {
             self.log.note("launcher", &one_line(error));
@@ -130,10 +132,12 @@ impl<'a> JoinedLauncher<'a> {
     fn watch(&mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
-            if let Some(signal) = self.signals.received() {
+            if let Some(signal) = self.signals.received()
+                && self.end_request.is_none()
+            {
                 let what = format!("{} ends the work for the run", signals::describe(signal));
                 self.log.note("launcher", &what);
-                return Ok(JoinEnd::Interrupted(signal));
+                self.end_request = Some((Instant::now(), JoinEnd::Interrupted(signal)));
             }
             self.lock.check(self.run)?;
             self.read_heartbeats()?;
@@ -153,8 +157,11 @@ impl<'a> JoinedLauncher<'a> {
             for slow in self.supervisor.report_slow(&self.stalls) {
                 self.log.note("launcher", &slow);
             }
-            if self.stop_requested {
-                return Ok(JoinEnd::Stopped);
+            // A relay that has just died is restarted first, so that it passes on what the actors have sent.
+            if let Some((at, ending)) = self.end_request
+                && (self.supervisor.is_ready(Role::Relay) || at.elapsed() >= RESTART)
+            {
+                return Ok(ending);
             }
             if self.has_lost_actors {
                 return Ok(JoinEnd::LostActors);
@@ -184,8 +191,8 @@ impl<'a> JoinedLauncher<'a> {
 }
 
 impl EndRoles for JoinedLauncher<'_> {
-    fn supervisor(&mut self) -> &mut Supervisor {
-        &mut self.supervisor
+    fn parts(&mut self) -> (&mut Supervisor, &Domain) {
+        (&mut self.supervisor, self.domain)
     }
 
     fn answer_requests(&mut self) -> anyhow::Result<()> {
@@ -193,7 +200,7 @@ impl EndRoles for JoinedLauncher<'_> {
             control,
             run,
             supervisor,
-            stop_requested,
+            end_request,
             has_lost_actors,
             config,
             ..
@@ -207,7 +214,7 @@ impl EndRoles for JoinedLauncher<'_> {
                     ..RunStatus::default()
                 })),
                 ControlRequest::Stop => {
-                    *stop_requested = true;
+                    end_request.get_or_insert_with(|| (Instant::now(), JoinEnd::Stopped));
                     None
                 }
                 ControlRequest::Replace { actor, incarnation } => {

@@ -100,6 +100,8 @@ pub(super) struct Supervisor {
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     processes_started: u64,
+    /// The number in that file. Those up to it may be used without writing the file again.
+    reserved: u64,
     faults: Faults,
     /// A role is given up if its failures span this time.
     give_up_after: Duration,
@@ -171,6 +173,7 @@ impl Supervisor {
             server_start_limit: (!config.environment.server.is_empty()).then(|| config.environment.start_limit()),
             counter,
             processes_started: started,
+            reserved: started,
             faults: Faults {
                 count: 0,
                 most: config.environment.faults,
@@ -186,6 +189,7 @@ impl Supervisor {
     /// Starts all processes.
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
+        self.reserve_incarnations((self.children.len() + self.missing().len()) as u64)?;
         (0..self.children.len()).try_for_each(|i| self.start(i))?;
         self.start_missing(domain)
     }
@@ -195,17 +199,31 @@ impl Supervisor {
         std::mem::take(&mut self.incidents)
     }
 
-    fn write_counter(&self) -> anyhow::Result<()> {
-        let text = self.processes_started.to_string();
-        write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
-            .with_context(|| format!("cannot write {}", self.counter.display()))
+    /// Makes sure that no later launcher uses the next `count` incarnations. Doing so for several processes at once saves
+    /// time: on a slow disk, each writing takes up to a second.
+    fn reserve_incarnations(&mut self, count: u64) -> anyhow::Result<()> {
+        let needed = self.processes_started + count;
+        if needed > self.reserved {
+            let text = needed.to_string();
+            write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
+                .with_context(|| format!("cannot write {}", self.counter.display()))?;
+            self.reserved = needed;
+        }
+        Ok(())
+    }
+
+    /// Takes the next `count` incarnations. Returns the first of them.
+    fn take_incarnations(&mut self, count: u64) -> anyhow::Result<u64> {
+        self.reserve_incarnations(count)?;
+        let first = self.processes_started + 1;
+        self.processes_started += count;
+        Ok(first)
     }
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
-        self.processes_started += 1;
-        self.write_counter()?;
+        let incarnation = self.take_incarnations(1)?;
         let child = &mut self.children[i];
-        child.instance.incarnation = self.processes_started;
+        child.instance.incarnation = incarnation;
         let writer = match child.instance.role {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
@@ -221,16 +239,33 @@ impl Supervisor {
     ///
     /// # Errors
     /// When it cannot be started.
-    pub(super) fn ensure_gate(&mut self) -> anyhow::Result<()> {
-        if self.joined_hosts.leases().is_empty() {
-            return Ok(());
+    pub(super) fn ensure_gate(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        if !self.joined_hosts.leases().is_empty() {
+            self.start_again_if_dead(Role::Gate, domain)?;
         }
-        self.reap(|role| role == Role::Gate);
-        let is_missing = |child: &Child| child.instance.role == Role::Gate && child.process.is_none();
-        match self.children.iter().position(is_missing) {
-            Some(i) => self.start(i),
-            None => Ok(()),
+        Ok(())
+    }
+
+    /// Starts the only process of a role again if it has died without having finished. Returns whether it had.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub(super) fn start_again_if_dead(&mut self, role: Role, domain: &Domain) -> anyhow::Result<bool> {
+        self.reap(|which| which == role);
+        let is_dead = |child: &Child| child.is(role, 0) && child.process.is_none();
+        let Some(i) = self.children.iter().position(is_dead) else {
+            return Ok(false);
+        };
+        if role == Role::Learner {
+            if self.learner_done {
+                return Ok(false);
+            }
+            self.unsaved_learner = None;
         }
+        self.cleaning.clean(domain, &self.services, &self.log);
+        self.start(i)?;
+        self.note_incident(i, IncidentKind::StartedAgain, String::new());
+        Ok(true)
     }
 
     /// Records a heartbeat.
@@ -266,10 +301,10 @@ impl Supervisor {
         of_role.find_map(Child::activity)
     }
 
-    /// Whether there is a learner that is ready.
-    pub(super) fn learner_is_ready(&self) -> bool {
-        let learner = self.learner();
-        learner.is_some_and(|learner| learner.process.is_some() && learner.is_ready())
+    /// Whether the only process of this role runs and is ready.
+    pub(super) fn is_ready(&self, role: Role) -> bool {
+        let mut children = self.children.iter();
+        children.any(|child| child.is(role, 0) && child.process.is_some() && child.is_ready())
     }
 
     /// Total number of restarts.

@@ -293,6 +293,38 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
 }
 
 #[test]
+fn a_host_whose_relay_has_just_died_hands_over_what_it_has() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    // The launcher learns of the death and of the signal at the same time.
+    host.running.signal(Signal::STOP);
+    host.running.kill("relay-0");
+    host.running.signal(Signal::TERM);
+    host.running.signal(Signal::CONT);
+    until("the host has left", || run.hosts().is_empty());
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(128 + 15);
+    assert_eq!(in_replay(&run.running.run, &[1, 2]), sent);
+    stop(run);
+}
+
+#[test]
+fn hosts_end_with_a_run_that_is_stopped_while_it_moves_to_new_shared_memory() {
+    let run = Run::start(&["--actors", "2"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[2]);
+    // It does not end when asked to, so there is time for the request.
+    run.running.stop_role("actor-1");
+    run.running.kill_beyond_cleaning("actor-0");
+    until("new shared memory is reported", || {
+        run.running.log().contains("continues in new shared memory")
+    });
+    stop(run);
+    host.ends_with(0);
+}
+
+#[test]
 fn hosts_end_with_a_run_whose_gate_has_just_died() {
     let run = Run::start(&["--actors", "1"]);
     let host = Host::join(&run, &["--actors", "1"]);

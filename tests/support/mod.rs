@@ -291,11 +291,37 @@ impl Running {
 
     /// Waits until the launcher has ended. Returns its exit code and its standard output.
     pub(crate) fn wait_for_launcher(mut self) -> (Option<i32>, String) {
-        until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
+        until_within(COMMAND_TIMEOUT, "the launcher has ended", || {
+            self.child.try_wait().unwrap().is_some()
+        });
         let code = self.child.wait().unwrap().code();
         let mut printed = String::new();
         std::io::Read::read_to_string(self.child.stdout.as_mut().unwrap(), &mut printed).unwrap();
         (code, printed)
+    }
+
+    /// Kills a role and removes the files that the launcher needs to clean up after it. What the process occupied in
+    /// shared memory stays occupied.
+    pub(crate) fn kill_beyond_cleaning(&self, who: &str) {
+        let pid = *self.pids(who).last().unwrap();
+        let node = node_of(pid);
+        assert!(node.len() > 1, "{node:?}");
+        // The launcher must find the process dead and the files gone.
+        self.signal(Signal::STOP);
+        self.kill(who);
+        until("the process is dead", || {
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+            stat.contains(") Z ")
+        });
+        for path in node {
+            let removed = if path.is_dir() {
+                std::fs::remove_dir_all(&path)
+            } else {
+                std::fs::remove_file(&path)
+            };
+            removed.unwrap();
+        }
+        self.signal(Signal::CONT);
     }
 
     /// Processes and shared memory of this run.
@@ -528,15 +554,32 @@ pub(crate) fn output_of(command: &mut Command) -> Output {
 }
 
 /// Polls until `holds` returns true.
-pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
+pub(crate) fn until(what: &str, holds: impl FnMut() -> bool) {
+    until_within(TIMEOUT, what, holds);
+}
+
+fn until_within(limit: Duration, what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
-        assert!(
-            begun.elapsed() < TIMEOUT,
-            "waited {TIMEOUT:?} without success until {what}"
-        );
+        assert!(begun.elapsed() < limit, "waited {limit:?} without success until {what}");
         std::thread::sleep(Duration::from_millis(10));
     }
+}
+
+/// iceoryx2's files for a process of the run: the directory of its node, and the files that show whether it is alive.
+fn node_of(pid: i32) -> Vec<PathBuf> {
+    let open = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
+    let mut open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
+    let details = open
+        .find(|file| file.to_string_lossy().ends_with("node.details"))
+        .unwrap();
+    let directory = details.parent().unwrap();
+    let id = directory.file_name().unwrap().to_string_lossy().into_owned();
+    let nodes = std::fs::read_dir(directory.parent().unwrap()).unwrap().flatten();
+    nodes
+        .map(|entry| entry.path())
+        .filter(|path| path.to_string_lossy().contains(&id))
+        .collect()
 }
 
 fn pids(log: &str) -> Vec<(String, i32)> {

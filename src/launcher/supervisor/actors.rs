@@ -81,15 +81,23 @@ impl Supervisor {
     /// Adds and starts the wanted actors that do not exist, each with its environment server.
     pub(super) fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
-        for index in self.actors.clone() {
-            for role in [Role::EnvServer, Role::Actor] {
-                if !self.children.iter().any(|child| child.is(role, index)) {
-                    self.children.push(Child::new(role, index));
-                    self.start(self.children.len() - 1)?;
-                }
-            }
+        let missing = self.missing();
+        self.reserve_incarnations(missing.len() as u64)?;
+        for (role, index) in missing {
+            self.children.push(Child::new(role, index));
+            self.start(self.children.len() - 1)?;
         }
         Ok(())
+    }
+
+    /// The wanted actors and environment servers that do not exist, each server before its actor.
+    pub(super) fn missing(&self) -> Vec<(Role, u32)> {
+        let wanted = self.actors.iter();
+        let mut missing: Vec<_> = wanted
+            .flat_map(|index| [(Role::EnvServer, *index), (Role::Actor, *index)])
+            .collect();
+        missing.retain(|(role, index)| !self.children.iter().any(|child| child.is(*role, *index)));
+        missing
     }
 
     /// Retires surplus actors and then their environment servers.

@@ -56,9 +56,7 @@ impl Supervisor {
             )));
         };
         actors.sort_unstable();
-        let first_incarnation = self.processes_started + 1;
-        self.processes_started += INCARNATIONS;
-        self.write_counter()?;
+        let first_incarnation = self.take_incarnations(INCARNATIONS)?;
         // The learner opens those of all actors up to the last one.
         let last = actors.iter().max().copied();
         self.create_transitions(domain, last.map_or(0..0, |last| 0..last + 1))?;
@@ -70,7 +68,7 @@ impl Supervisor {
             epoch: self.joined_hosts.epoch(),
             actors,
             first_incarnation,
-            limit: self.processes_started + 1,
+            limit: first_incarnation + INCARNATIONS,
         };
         self.joined_hosts.admit(lease.clone());
         self.share_lockstep_actors();

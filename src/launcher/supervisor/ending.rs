@@ -43,8 +43,9 @@ impl Supervisor {
             match process.exit_status() {
                 Some(status) => {
                     child.process = None;
-                    if child.instance.role == Role::Learner && !status.success() {
-                        self.unsaved_learner = Some(ending(status));
+                    if child.instance.role == Role::Learner {
+                        self.learner_done = status.success();
+                        self.unsaved_learner = (!status.success()).then(|| ending(status));
                     }
                 }
                 None => all = false,

@@ -1,7 +1,7 @@
 //! A CSV file of rows of one type, opened for appending.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -37,11 +37,16 @@ pub enum RecordError {
     },
 }
 
+/// More bytes than `csv::Writer` passes on at once.
+const BUFFER: usize = 1 << 16;
+
 /// A table open for appending.
 #[derive(Debug)]
 pub(super) struct Table {
     path: PathBuf,
-    rows: csv::Writer<File>,
+    // After a failed write, `csv::Writer` repeats its whole buffer, even if a part of it is in the file already, as on a
+    // full disk. `BufWriter` continues where the write ended.
+    rows: csv::Writer<BufWriter<File>>,
 }
 
 impl Table {
@@ -81,7 +86,9 @@ impl Table {
 
     /// Appends to a file that has its header.
     pub(super) fn onto(path: &Path, file: File) -> Self {
-        let rows = csv::WriterBuilder::new().has_headers(false).from_writer(file);
+        let rows = csv::WriterBuilder::new()
+            .has_headers(false)
+            .from_writer(BufWriter::with_capacity(BUFFER, file));
         Self {
             path: path.to_owned(),
             rows,
