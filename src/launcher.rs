@@ -67,6 +67,9 @@ const OTHERS_END: Duration = Duration::from_secs(15);
 /// How long the gate may take to let the other hosts hand over their last chunks.
 const GATE_END: Duration = Duration::from_secs(8);
 
+/// How many gates may try to. One may be killed meanwhile.
+const GATES: usize = 3;
+
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
@@ -453,11 +456,17 @@ impl<'a> Launcher<'a> {
         self.supervisor.check_saved()
     }
 
-    /// Tells the other hosts that the run is over. A gate that has just died is started again for that.
+    /// Tells the other hosts that the run is over. A gate that has just died, or dies meanwhile, is started again for
+    /// that.
     fn tell_hosts(&mut self, receiver: Option<Role>) -> anyhow::Result<()> {
-        self.supervisor.ensure_gate(self.domain)?;
-        self.supervisor.ask_to_retire(Role::Gate);
-        self.await_end(|role| role == Role::Gate, GATE_END, receiver);
+        for _ in 0..GATES {
+            self.supervisor.ensure_gate(self.domain)?;
+            self.supervisor.ask_to_retire(Role::Gate);
+            self.await_end(|role| role == Role::Gate, GATE_END, receiver);
+            if !self.supervisor.has_failed(Role::Gate) {
+                break;
+            }
+        }
         Ok(())
     }
 

@@ -10,13 +10,13 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::records::recorder::{RecordError, Recorder, read_evaluations};
 use signal_hook::consts::SIGXFSZ;
 
-fn limit_file_size(most: Option<u64>) {
+fn limit_file_size(most: Option<u64>) -> rustix::io::Result<()> {
     let limits = getrlimit(Resource::Fsize);
     let limits = Rlimit {
         current: most.or(limits.maximum),
         ..limits
     };
-    setrlimit(Resource::Fsize, limits).unwrap();
+    setrlimit(Resource::Fsize, limits)
 }
 
 #[test]
@@ -40,12 +40,12 @@ fn a_record_has_each_row_once_after_a_write_that_was_cut_short() {
     };
     record(1).unwrap();
     let size = run.evaluations().metadata().unwrap().len();
-    limit_file_size(Some(size + 10));
+    limit_file_size(Some(size + 10)).unwrap();
     let refused = record(2);
     assert!(matches!(refused, Err(RecordError::Write { .. })), "{refused:?}");
     let cut = run.evaluations().metadata().unwrap().len();
     assert_eq!(cut, size + 10, "a part of the row is in the file");
-    limit_file_size(None);
+    limit_file_size(None).unwrap();
     record(3).unwrap();
     drop(recorder);
 

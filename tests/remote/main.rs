@@ -293,6 +293,29 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
 }
 
 #[test]
+fn hosts_end_with_a_run_whose_gate_dies_while_it_tells_them() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[1]);
+    // So that the gate has to wait.
+    host.running.stop_role("relay-0");
+    let actor = run.running.pids("actor-0")[0];
+    let mut stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    until("the actor has ended", || {
+        !run.running.leftovers().processes().contains(&actor)
+    });
+    std::thread::sleep(Duration::from_millis(300));
+    run.running.kill_if_alive("gate-0");
+    until("there is another gate", || run.running.pids("gate-0").len() == 2);
+    host.running.continue_role("relay-0");
+    until("the run is stopped", || stop.try_wait().unwrap().is_some());
+    assert!(stop.wait().unwrap().success());
+    let Run { place, running } = run;
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    host.ends_with(0);
+}
+
+#[test]
 fn a_host_whose_relay_has_just_died_hands_over_what_it_has() {
     let run = Run::start(&["--actors", "1"]);
     let host = Host::join(&run, &["--actors", "2"]);

@@ -42,7 +42,7 @@ impl Supervisor {
             let Some(process) = &mut child.process else { continue };
             match process.exit_status() {
                 Some(status) => {
-                    child.process = None;
+                    (child.process, child.ended) = (None, Some(status));
                     if child.instance.role == Role::Learner {
                         self.learner_done = status.success();
                         self.unsaved_learner = (!status.success()).then(|| ending(status));
@@ -52,6 +52,13 @@ impl Supervisor {
             }
         }
         all
+    }
+
+    /// Whether the only process of a role has ended by itself, and not in order.
+    pub(crate) fn has_failed(&self, role: Role) -> bool {
+        let mut children = self.children.iter();
+        let ended = children.find(|child| child.is(role, 0)).and_then(|child| child.ended);
+        ended.is_some_and(|status| !status.success())
     }
 
     /// Kills the processes of some roles that did not end when they were asked to.
