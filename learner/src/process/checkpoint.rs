@@ -9,6 +9,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use bincode::config::{self, Config};
+use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
 use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
 
@@ -64,6 +65,14 @@ pub enum CheckpointError {
              last checkpoint is intact)"
     )]
     Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// It could not be read. It may be whole.
+    #[error("{path}: cannot read the checkpoint: {source}; the file was left as it is")]
+    Read {
         /// The file.
         path: PathBuf,
         /// The system's reason.
@@ -282,6 +291,10 @@ impl Checkpoints {
         let body = match durable::read_sealed(KIND, &path) {
             Ok(body) => body,
             Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(CheckpointFile::Missing),
+            // Only a broken disk is damage. Other reasons may pass, such as too many open files.
+            Err(SealError::Io(source)) if source.raw_os_error() != Some(Errno::IO.raw_os_error()) => {
+                return Err(CheckpointError::Read { path, source });
+            }
             Err(error @ SealError::Version { .. }) => return Err(refused(error.to_string())),
             Err(error) => return Ok(CheckpointFile::Damaged(error.to_string())),
         };

@@ -179,6 +179,24 @@ fn a_checkpoint_of_another_configuration_is_refused_and_not_replaced() {
 }
 
 #[test]
+fn a_checkpoint_that_cannot_be_opened_is_refused_and_not_put_aside() {
+    let (directory, latest, _) = two();
+    let before = fs::read(&latest).unwrap();
+    let away = latest.with_extension("away");
+    fs::rename(&latest, &away).unwrap();
+    // A link to itself cannot be opened, not even by root.
+    std::os::unix::fs::symlink(&latest, &latest).unwrap();
+    let is_refused = |result: Result<(), CheckpointError>| matches!(result, Err(CheckpointError::Read { .. }));
+    assert!(is_refused(load(&directory).map(drop)));
+    assert!(is_refused(
+        Checkpoints::new(directory.path(), 7).save(&counters(3), &[])
+    ));
+    fs::rename(away, &latest).unwrap();
+    assert_eq!(fs::read(&latest).unwrap(), before);
+    assert_eq!(updates(&directory), 2);
+}
+
+#[test]
 fn a_checkpoint_of_another_version_is_refused() {
     let (directory, latest, _) = two();
     durable::write_atomically(&latest, |file| {
