@@ -9,6 +9,7 @@ use zenoh::{Session, Wait};
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::network::{self, NetworkError, failed};
+use crate::relay::REJOIN_INTERVAL;
 use crate::wire::{Admission, Hello, HostReport, Message, WireError};
 
 /// How long the gate may take to answer.
@@ -103,7 +104,7 @@ impl LeaseKeeper {
 }
 
 /// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `patience` is over, or `stop` returns
-/// true. The connection is for a [`LeaseKeeper`].
+/// true; also after a refusal, if `ask_again` returns true for its reason. The connection is for a [`LeaseKeeper`].
 ///
 /// # Errors
 /// When there is no answer, or it cannot be read.
@@ -113,13 +114,15 @@ pub fn join(
     hello: &Hello,
     patience: Duration,
     stop: impl Fn() -> bool,
+    ask_again: impl Fn(&str) -> bool,
 ) -> Result<(Admission, GateConnection), JoinError> {
     let session = network::connect(endpoint, key)?;
     let begun = Instant::now();
+    let may_wait = || begun.elapsed() < patience && !stop();
     loop {
         // Without a key nobody knows which run it is, and only one can be there.
         match ask_to_join(&session, key.map_or("*", |key| &key.run_id), hello) {
-            Err(JoinError::Silence { .. }) if begun.elapsed() < patience && !stop() => std::thread::sleep(PAUSE),
+            Err(JoinError::Silence { .. }) if may_wait() => std::thread::sleep(PAUSE),
             Err(JoinError::Silence { .. }) => {
                 let endpoint = endpoint.to_string();
                 return Err(JoinError::Silence { endpoint });
@@ -128,6 +131,7 @@ pub fn join(
                 session.close().wait().map_err(failed("close"))?;
                 return Err(error);
             }
+            Ok(Admission::Refused(why)) if may_wait() && ask_again(&why) => std::thread::sleep(REJOIN_INTERVAL),
             Ok(admission) => return Ok((admission, GateConnection(session))),
         }
     }

@@ -56,7 +56,7 @@ const POLICY_PAUSE: Duration = Duration::from_millis(50);
 const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// How long to wait before asking again to be admitted.
-const REJOIN_INTERVAL: Duration = Duration::from_secs(1);
+pub(crate) const REJOIN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// What the relay needs.
 #[derive(Clone, Debug)]

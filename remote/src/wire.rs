@@ -177,7 +177,7 @@ pub struct PolicyRequest {
 pub struct Hello {
     /// Version of the program.
     pub program: String,
-    /// A number that the host has drawn; it keeps it as long as `shoal join` runs.
+    /// A number that the host has drawn; it keeps it until it joins again.
     pub host: u64,
     /// The host's name, for people.
     pub name: String,

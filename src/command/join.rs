@@ -93,6 +93,7 @@ use with_network::join;
 
 #[cfg(feature = "remote")]
 mod with_network {
+    use std::cell::Cell;
     use std::path::Path;
 
     use anyhow::{Context, bail};
@@ -111,7 +112,7 @@ mod with_network {
     use super::*;
     use crate::launcher::joined::{self, JoinEnd};
 
-    /// The exit code if the run could not be reached for too long.
+    /// The exit code if the run could not be reached, or did not admit the host again, for too long.
     const GAVE_UP: u8 = 4;
 
     /// This host, as the run knows it, and how it reaches the run.
@@ -163,12 +164,24 @@ mod with_network {
             held: Vec::new(),
         };
         let ends = || interrupt.signal().is_some() || is_finished(run);
-        let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends);
+        // Of a host that joins again, the run may still have what this host is giving back.
+        let said = Cell::new(false);
+        let ask_again = |why: &str| {
+            if time > 1 && !said.replace(true) {
+                say(format!("{endpoint} does not admit this host yet: {why}"));
+            }
+            time > 1
+        };
+        let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends, ask_again);
         if let Some(signal) = interrupt.signal() {
             return Ok(Some(exit_code(signal)));
         }
         let (lease, connection) = match admission {
             Ok((Admission::Admitted(lease), connection)) => (lease, connection),
+            Ok((Admission::Refused(why), _)) if time > 1 => {
+                say(format!("error: {endpoint} does not admit this host again: {why}"));
+                return Ok(Some(GAVE_UP.into()));
+            }
             Ok((Admission::Refused(why), _)) => bail!("{endpoint} does not admit this host: {why}"),
             Err(JoinError::Silence { .. }) if is_finished(run) => {
                 say("the run is over");
