@@ -54,10 +54,12 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct GateConnection(Session);
 
-/// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own.
+/// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own. If it is
+/// dropped, the host leaves and its actors are free.
 #[derive(Debug)]
 pub struct LeaseKeeper {
-    thread: JoinHandle<()>,
+    /// `None` if nobody waits for its end.
+    thread: Option<JoinHandle<()>>,
     /// Ends the thread; true if the host leaves.
     end: Sender<bool>,
 }
@@ -93,13 +95,24 @@ impl LeaseKeeper {
             let _ = connection.0.close().wait();
         };
         let thread = std::thread::Builder::new().name("lease".into()).spawn(keep)?;
+        let thread = Some(thread);
         Ok(Self { thread, end })
     }
 
-    /// Ends the reports: the relay sends them from now on, or the host leaves and its actors are free.
-    pub fn end(self, leaves: bool) {
-        let _ = self.end.send(leaves);
-        let _ = self.thread.join();
+    /// Ends the reports, because the relay sends them from now on. The connection may take a while to close.
+    pub fn end(mut self) {
+        let _ = self.end.send(false);
+        self.thread = None;
+    }
+}
+
+impl Drop for LeaseKeeper {
+    fn drop(&mut self) {
+        // After `end` nobody reads it.
+        let _ = self.end.send(true);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
     }
 }
 

@@ -173,25 +173,23 @@ mod with_network {
             time > 1
         };
         let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends, ask_again);
-        if let Some(signal) = interrupt.signal() {
-            return Ok(Some(exit_code(signal)));
-        }
-        let (lease, connection) = match admission {
-            Ok((Admission::Admitted(lease), connection)) => (lease, connection),
-            Ok((Admission::Refused(why), _)) if time > 1 => {
+        let (lease, connection) = match (admission, interrupt.signal()) {
+            (Ok((Admission::Admitted(lease), connection)), _) => (lease, connection),
+            (_, Some(signal)) => return Ok(Some(exit_code(signal))),
+            (Ok((Admission::Refused(why), _)), None) if time > 1 => {
                 say(format!("error: {endpoint} does not admit this host again: {why}"));
                 return Ok(Some(GAVE_UP.into()));
             }
-            Ok((Admission::Refused(why), _)) => bail!("{endpoint} does not admit this host: {why}"),
-            Err(JoinError::Silence { .. }) if is_finished(run) => {
+            (Ok((Admission::Refused(why), _)), None) => bail!("{endpoint} does not admit this host: {why}"),
+            (Err(JoinError::Silence { .. }), None) if is_finished(run) => {
                 say("the run is over");
                 return Ok(Some(ExitCode::SUCCESS));
             }
-            Err(error @ JoinError::Silence { .. }) => {
+            (Err(error @ JoinError::Silence { .. }), None) => {
                 say(format!("error: {error}"));
                 return Ok(Some(GAVE_UP.into()));
             }
-            Err(error) => return Err(error.into()),
+            (Err(error), None) => return Err(error.into()),
         };
         let temporary = std::env::temp_dir().join(format!("shoal-join-{number:016x}"));
         let path = match (&args.local, time) {
@@ -231,23 +229,22 @@ mod with_network {
         } = host;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
-        // The environment may take minutes to start, and it may not be usable here.
+        // The environment may take minutes to start, and it may not be usable here. Until the relay runs, whatever fails
+        // drops this, and the run has its actors back.
         let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
-        let prepare = || {
-            let interrupt = signals.interrupt();
-            let made = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
-            if let Some(key) = key {
-                key.write(&made.1.path().join(KeyFile::JOIN))?;
-            }
-            HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&made.1)?;
-            anyhow::Ok(made)
-        };
-        let prepared = prepare();
-        keeper.end(prepared.is_err());
-        let (config, run, lock) = prepared?;
+        let interrupt = signals.interrupt();
+        if let Some(signal) = interrupt.signal() {
+            return Ok(Some(exit_code(signal)));
+        }
+        let (config, run, lock) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
+        if let Some(key) = key {
+            key.write(&run.path().join(KeyFile::JOIN))?;
+        }
+        HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&run)?;
         let actors = lease.actors.clone();
         say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
-        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
+        let relay_runs = Box::new(|| keeper.end());
+        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up, relay_runs)?;
         Ok(Some(match ending {
             JoinEnd::Over => {
                 say("the run is over");

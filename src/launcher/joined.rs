@@ -41,19 +41,21 @@ pub(crate) enum JoinEnd {
     Interrupted(i32),
 }
 
-/// Works for the run until one of these endings. `config` and `run` are those of this host.
+/// Works for the run until one of these endings. `config` and `run` are those of this host. `relay_runs` is called when
+/// the relay does; if it never does, it is dropped.
 pub(crate) fn run(
     config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
     actors: Vec<u32>,
     give_up: Duration,
+    relay_runs: Box<dyn FnOnce()>,
 ) -> anyhow::Result<JoinEnd> {
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
         .and_then(|()| JoinedLauncher::new(config, (run, lock), &domain, signals, actors))
-        .and_then(|launcher| launcher.run(give_up));
+        .and_then(|launcher| launcher.run(give_up, relay_runs));
     // Also after an error: no role is left by now.
     let left = domain.leave();
     let ending = ending?;
@@ -108,8 +110,10 @@ impl<'a> JoinedLauncher<'a> {
         })
     }
 
-    fn run(mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
-        let ending = self.watch(give_up);
+    fn run(mut self, give_up: Duration, relay_runs: Box<dyn FnOnce()>) -> anyhow::Result<JoinEnd> {
+        // If it is not called, it is dropped at the end: a relay that begins to run meanwhile needs the host's actors.
+        let mut relay_runs = Some(relay_runs);
+        let ending = self.watch(give_up, &mut relay_runs);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
@@ -129,7 +133,7 @@ impl<'a> JoinedLauncher<'a> {
         ending
     }
 
-    fn watch(&mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
+    fn watch(&mut self, give_up: Duration, relay_runs: &mut Option<Box<dyn FnOnce()>>) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received()
@@ -166,7 +170,11 @@ impl<'a> JoinedLauncher<'a> {
             if self.has_lost_actors {
                 return Ok(JoinEnd::LostActors);
             }
-            match self.supervisor.activity(Role::Relay) {
+            let activity = self.supervisor.activity(Role::Relay);
+            if let Some(relay_runs) = relay_runs.take_if(|_| activity.is_some()) {
+                relay_runs();
+            }
+            match activity {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
                 Some(Activity::Working) => self.cut_off_since = None,
                 _ => {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
 use support::{
@@ -508,6 +508,39 @@ fn a_host_that_cannot_work_gives_its_actors_back_and_its_name_is_shown_plainly()
     assert!(shown.starts_with("node[31m-xx") && shown.len() == 64, "{shown}");
     stop(run);
     host.ends_with(0);
+}
+
+#[test]
+fn a_host_that_ends_before_its_relay_runs_gives_its_actors_back() {
+    let run = Run::start(&["--actors", "1"]);
+    let (place, endpoint) = (Workplace::new(), run.endpoint());
+    let join = ["join", &endpoint, "--actors", "1"];
+    let all_have_left = || {
+        let log = run.running.log();
+        let count = |what| log.matches(what).count();
+        count("is admitted with actors") == count("has left")
+    };
+    // It may not open as many files as its processes need.
+    let mut limited = Command::new("sh");
+    limited.args(["-c", "ulimit -n 300; exec \"$@\"", "sh", env!("CARGO_BIN_EXE_shoal")]);
+    limited.args(join).env("TMPDIR", place.path()).stdin(Stdio::null());
+    let failed = output_of(&mut limited);
+    let why = String::from_utf8_lossy(&failed.stderr);
+    assert_eq!(failed.status.code(), Some(1));
+    assert!(why.contains("open files in one process"), "{why}");
+    assert!(run.running.log().contains("is admitted with actors"));
+    // Sooner than after `remote.lost_seconds`.
+    until("the host has left", all_have_left);
+    // A signal comes before the answer of the run.
+    run.running.signal(Signal::STOP);
+    let mut ended = place.shoal(&join).env("TMPDIR", place.path()).spawn().unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    kill_process(Pid::from_child(&ended), Signal::TERM).unwrap();
+    run.running.signal(Signal::CONT);
+    until("join has ended", || ended.try_wait().unwrap().is_some());
+    until("the host has left", all_have_left);
+    assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0);
+    stop(run);
 }
 
 #[test]
