@@ -94,6 +94,7 @@ use with_network::join;
 #[cfg(feature = "remote")]
 mod with_network {
     use std::cell::Cell;
+    use std::os::unix::fs::MetadataExt;
     use std::path::Path;
 
     use anyhow::{Context, bail};
@@ -115,6 +116,9 @@ mod with_network {
     /// The exit code if the run could not be reached, or did not admit the host again, for too long.
     const GAVE_UP: u8 = 4;
 
+    /// How the names of temporary directories begin; the host's number follows.
+    const TEMPORARY: &str = "shoal-join-";
+
     /// This host, as the run knows it, and how it reaches the run.
     struct JoiningHost {
         number: u64,
@@ -128,6 +132,7 @@ mod with_network {
     pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
         let (endpoint, key) = endpoint(args, run)?;
+        remove_abandoned(&std::env::temp_dir());
         let signals = Signals::register()?;
         let mut time = 1;
         loop {
@@ -191,7 +196,7 @@ mod with_network {
             }
             (Err(error), None) => return Err(error.into()),
         };
-        let temporary = std::env::temp_dir().join(format!("shoal-join-{number:016x}"));
+        let temporary = std::env::temp_dir().join(format!("{TEMPORARY}{number:016x}"));
         let path = match (&args.local, time) {
             (None, _) => temporary,
             (Some(local), 1) => local.clone(),
@@ -206,9 +211,11 @@ mod with_network {
         };
         let worked = work(args, host, (lease, connection), path, signals);
         if args.local.is_none() {
-            match &worked {
-                Ok(_) => drop(std::fs::remove_dir_all(path)),
-                Err(_) => say(format!("the log of this host is {}", path.join("shoal.log").display())),
+            let log = RunDir::planned(path).log();
+            if worked.is_err() && log.exists() {
+                say(format!("the log of this host is {}", log.display()));
+            } else {
+                let _ = std::fs::remove_dir_all(path);
             }
         }
         worked
@@ -244,8 +251,12 @@ mod with_network {
         let actors = lease.actors.clone();
         say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let relay_runs = Box::new(|| keeper.end());
-        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up, relay_runs)?;
-        Ok(Some(match ending {
+        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up, relay_runs);
+        if args.local.is_none() && ending.is_err() {
+            // While this process has the lock, so that no other one takes the directory for an abandoned one.
+            keep_log(&run);
+        }
+        Ok(Some(match ending? {
             JoinEnd::Over => {
                 say("the run is over");
                 ExitCode::SUCCESS
@@ -261,6 +272,42 @@ mod with_network {
                 GAVE_UP.into()
             }
         }))
+    }
+
+    /// Removes the temporary directories of hosts that were killed, with their copies of the key. A directory with a
+    /// configuration was locked by its host before the configuration was written, and is locked as long as the host lives.
+    fn remove_abandoned(temporary: &Path) {
+        let user = rustix::process::getuid().as_raw();
+        let is_number = |text: &str| text.len() == 16 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+        for entry in std::fs::read_dir(temporary).into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            let has_name = name
+                .to_str()
+                .and_then(|name| name.strip_prefix(TEMPORARY))
+                .is_some_and(is_number);
+            // Of a symbolic link, this is the metadata of the link.
+            let is_ours = |metadata: std::fs::Metadata| metadata.is_dir() && metadata.uid() == user;
+            if !(has_name && entry.metadata().is_ok_and(is_ours)) {
+                continue;
+            }
+            if let Ok(run) = RunDir::open(&entry.path())
+                && let Ok(false) = run.is_running()
+                && let Ok(_lock) = run.lock()
+            {
+                // What cannot be removed is left to the next host.
+                let _ = std::fs::remove_dir_all(entry.path());
+            }
+        }
+    }
+
+    /// Removes everything but the log from the directory of a host that has failed.
+    fn keep_log(run: &RunDir) {
+        for entry in std::fs::read_dir(run.path()).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path != run.log() {
+                let _ = std::fs::remove_file(&path).or_else(|_| std::fs::remove_dir_all(&path));
+            }
+        }
     }
 
     /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.
