@@ -200,7 +200,7 @@ mod with_network {
         let path = match (&args.local, time) {
             (None, _) => temporary,
             (Some(local), 1) => local.clone(),
-            (Some(local), _) => PathBuf::from(format!("{}-{time}", local.display())),
+            (Some(local), _) => unused_name(local, time),
         };
         let path = path.as_path();
         let host = JoiningHost {
@@ -219,6 +219,18 @@ mod with_network {
             }
         }
         worked
+    }
+
+    /// The first of `local` with `-time`, `-time+1`, … at its end that does not exist. Another `join` may have left some.
+    fn unused_name(local: &Path, time: u32) -> PathBuf {
+        let mut number = time;
+        loop {
+            let path = PathBuf::from(format!("{}-{number}", local.display()));
+            if !path.exists() {
+                return path;
+            }
+            number += 1;
+        }
     }
 
     fn work(
