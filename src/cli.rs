@@ -111,6 +111,7 @@ pub(crate) struct TiedArgs {
 /// The arguments with which the launcher starts a clean-up of shared memory.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct CleanUpArgs {
+    pub(crate) launcher: u32,
     pub(crate) run_id: String,
 }
 

@@ -8,7 +8,7 @@ use std::process::Command;
 
 use rustix::process::Signal;
 use shoal_common::channel::Domain;
-use support::{Workplace, parse, until};
+use support::{Workplace, error_line, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
@@ -119,6 +119,16 @@ fn the_next_start_removes_what_a_killed_run_left_in_shared_memory() {
     running.kill_all();
     place.start("next", &["--steps", "100"]).wait();
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+}
+
+#[test]
+fn a_clean_up_whose_launcher_has_died_is_refused() {
+    let place = Workplace::new();
+    let clean_up = |launcher: u32| place.output(&["clean-up", &launcher.to_string(), "none"]);
+    // No process has this id.
+    let message = error_line(&clean_up(0));
+    assert!(message.contains("the parent process has ended"), "{message}");
+    assert!(clean_up(std::process::id()).status.success());
 }
 
 #[test]

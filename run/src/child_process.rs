@@ -19,7 +19,7 @@ use shoal_common::role::RoleInstance;
 pub use self::group::ChildGroup;
 pub use self::output::{ChildOutput, Line, Writer, escape_control_characters};
 pub use self::process::ChildProcess;
-pub use self::tied::{exec_tied, tied};
+pub use self::tied::{exec_tied, tie_to_parent, tied};
 
 /// The command that starts this program as a role of the run in this directory.
 pub fn role_command(instance: RoleInstance, run: &Path) -> Command {

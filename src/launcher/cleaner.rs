@@ -6,11 +6,10 @@ use std::process::{Command, ExitCode, ExitStatus};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use rustix::process::{Signal, set_parent_process_death_signal};
 use shoal_common::channel::{Domain, Services};
-use shoal_run::child_process::ChildGroup;
+use shoal_run::child_process::{ChildGroup, tie_to_parent};
 
-/// The hidden command of that child process. Its argument is the run's id.
+/// The hidden command of that child process. Its arguments are this process's id and the run's id.
 pub(crate) const COMMAND: &str = "clean-up";
 
 /// How long a clean-up may take. Usually it takes a few milliseconds.
@@ -42,18 +41,20 @@ pub(super) fn clean_up(domain: &Domain, services: &Services) -> anyhow::Result<(
 /// How the process ended; `None` if it took too long and is killed.
 fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
     let mut command = Command::new("/proc/self/exe");
-    command.arg0("shoal").args([COMMAND, run_id]);
+    command
+        .arg0("shoal")
+        .args([COMMAND, &std::process::id().to_string(), run_id]);
     // Its output is discarded; the exit code is enough.
     let (mut child, _, _) = ChildGroup::start(&mut command).context("cannot start a process that cleans up")?;
     Ok(child.wait(PATIENCE))
 }
 
-/// The work of the child process.
+/// The work of the child process of the launcher with this process id.
 ///
 /// # Errors
-/// When files cannot be listed or removed.
-pub(crate) fn work(run_id: &str) -> anyhow::Result<ExitCode> {
-    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot tie the clean-up to the launcher")?;
+/// When the launcher has died, or files cannot be listed or removed.
+pub(crate) fn work(launcher: u32, run_id: &str) -> anyhow::Result<ExitCode> {
+    tie_to_parent(launcher)?;
     match Domain::clean_up(run_id)? {
         0 => Ok(ExitCode::SUCCESS),
         _ => Ok(ExitCode::FAILURE),

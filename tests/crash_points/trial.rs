@@ -237,7 +237,7 @@ impl Case<'_> {
                     Ok(id) => id,
                     Err(what) => return Ok(Err(what)),
                 };
-                let followed = traced(command, &[command, &id]);
+                let followed = traced(command, &[command, &std::process::id().to_string(), &id]);
                 let _ = kill_process(launcher, Signal::CONT);
                 followed
             } else {

@@ -49,10 +49,20 @@ pub fn exec_tied(parent: u32, command_line: &[OsString]) -> anyhow::Result<ExitC
     let Some((program, arguments)) = command_line.split_first() else {
         bail!("there is no program to start");
     };
-    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot tie the program to its parent process")?;
+    tie_to_parent(parent)?;
+    let cause = Command::new(program).args(arguments).exec();
+    Err(anyhow::Error::from(cause).context(format!("cannot start {}", program.display())))
+}
+
+/// Ties this process to its parent process, whose id is `parent`: it is killed when that one dies.
+///
+/// # Errors
+/// When the parent has died already.
+pub fn tie_to_parent(parent: u32) -> anyhow::Result<()> {
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot tie this process to its parent process")?;
+    // It may have died before it was tied to.
     if getppid().map(Pid::as_raw_pid) != Some(parent as i32) {
         bail!("the parent process has ended");
     }
-    let cause = Command::new(program).args(arguments).exec();
-    Err(anyhow::Error::from(cause).context(format!("cannot start {}", program.display())))
+    Ok(())
 }
