@@ -44,6 +44,7 @@ pub use shoal_common::commit::{ActorCommit, ChunkId, ReplayLayout};
 
 pub use self::append::{Appended, FilledChunk, ReservedChunk};
 pub use self::error::{ChunkError, ReplayError};
+pub(crate) use self::file::unfinished_bytes;
 pub use self::step::WriteStep;
 pub use self::store::Replay;
 pub use self::sync::{PendingSync, SyncedRows};

@@ -14,7 +14,7 @@ use super::intake::IntakeError;
 use crate::algorithms::algorithm::StateArrayError;
 use crate::algorithms::registry;
 use crate::networks::threads::ThreadsError;
-use crate::replay::{ReplayError, ReplayLayout};
+use crate::replay::{ReplayError, ReplayLayout, unfinished_bytes};
 
 /// The settings of a learner.
 #[derive(Clone, Debug)]
@@ -90,7 +90,7 @@ pub enum SizeError {
 }
 
 /// Bytes that the learner's files need on the disk, for a run in the directory `run`. A replay that exists already is
-/// not counted.
+/// not counted, nor what a start that was killed has reserved for one.
 ///
 /// # Errors
 /// When the files would be too large.
@@ -100,7 +100,7 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
         0
     } else {
         let offsets = replay_layout(config).offsets().ok_or(SizeError::Replay { capacity })?;
-        offsets.end as u64
+        (offsets.end as u64).saturating_sub(unfinished_bytes(&run.replay_file()))
     };
     let (_, policy) = config.learned().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,

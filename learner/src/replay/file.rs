@@ -2,7 +2,7 @@
 
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -21,10 +21,7 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOf
     if fs::exists(path).map_err(io(path, "look for"))? {
         return Err(ReplayError::Exists(path.into()));
     }
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".new");
-    let temporary = PathBuf::from(temporary);
-
+    let temporary = temporary(path);
     let mut options = OpenOptions::new();
     // Truncated only under the lock, because another process may be creating it.
     let file = options
@@ -59,6 +56,20 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOf
     rename_to_new(&temporary.0, path)?;
     sync_directory_of(path).map_err(io(path, "sync"))?;
     Ok((file, offsets))
+}
+
+/// The name of the file at `path` while it is created.
+fn temporary(path: &Path) -> PathBuf {
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".new");
+    temporary.into()
+}
+
+/// Bytes of disk that a killed [`create`] has reserved for the file at `path`. The next one frees them first.
+pub(crate) fn unfinished_bytes(path: &Path) -> u64 {
+    /// In which the system counts, whatever the file system's own blocks are.
+    const BLOCK: u64 = 512;
+    fs::metadata(temporary(path)).map_or(0, |file| file.blocks() * BLOCK)
 }
 
 /// Opens the file and compares it with the layout before anything is mapped for writing.

@@ -69,3 +69,31 @@ fn parameters(config: &Config) -> usize {
 pub(super) fn open_files(config: &Config) -> u64 {
     FILES + FILES_PER_ACTOR * u64::from(config.actors.max)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+
+    use rustix::fs::{FallocateFlags, fallocate};
+
+    use super::*;
+    use crate::plan::resolve_preset;
+
+    #[test]
+    fn what_a_killed_start_has_reserved_for_the_replay_is_not_needed_again() {
+        const RESERVED: u64 = 1 << 20;
+        let config = resolve_preset("pendulum").unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDir::planned(directory.path());
+        let before = disk(&config, &run).unwrap();
+        let unfinished = File::create(directory.path().join("replay.bin.new")).unwrap();
+        assert_eq!(disk(&config, &run).unwrap(), before, "nothing is reserved yet");
+        fallocate(&unfinished, FallocateFlags::empty(), 0, RESERVED).unwrap();
+        let needed = disk(&config, &run).unwrap();
+        // A file system may need blocks of its own for the file.
+        assert!(
+            needed <= before - RESERVED && needed > before / 2,
+            "{needed} of {before}"
+        );
+    }
+}
