@@ -297,6 +297,33 @@ impl RunDir {
         write(&path, USED, config)
     }
 
+    /// Removes the directory with everything in it, `origin.json` first and `config.toml` last. If this is interrupted,
+    /// what is left can be removed like any run, and a run that lacks what it begins with does not look whole.
+    ///
+    /// # Errors
+    /// When something in it cannot be removed.
+    pub fn remove(&self) -> io::Result<()> {
+        let remove_if_any = |file: &Path| match std::fs::remove_file(file) {
+            Err(cause) if cause.kind() != ErrorKind::NotFound => Err(cause),
+            _ => Ok(()),
+        };
+        remove_if_any(&self.origin())?;
+        let config = self.config_file();
+        for entry in std::fs::read_dir(&self.path)? {
+            let entry = entry?;
+            if entry.path() == config {
+                continue;
+            }
+            if entry.file_type()?.is_dir() {
+                std::fs::remove_dir_all(entry.path())?;
+            } else {
+                std::fs::remove_file(entry.path())?;
+            }
+        }
+        remove_if_any(&config)?;
+        std::fs::remove_dir(&self.path)
+    }
+
     /// The directory itself.
     pub fn path(&self) -> &Path {
         &self.path

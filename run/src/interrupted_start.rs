@@ -26,7 +26,8 @@ pub fn remove_interrupted_start(path: &Path) -> anyhow::Result<bool> {
     let Ok(_lock) = run.lock() else { return Ok(false) };
     let is_interrupted = is_interrupted(&run)?;
     if is_interrupted {
-        std::fs::remove_dir_all(path).with_context(|| format!("cannot remove {}", path.display()))?;
+        run.remove()
+            .with_context(|| format!("cannot remove {}", path.display()))?;
     }
     Ok(is_interrupted)
 }
@@ -52,6 +53,10 @@ fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
 
 #[cfg(test)]
 mod tests {
+    use std::mem::MaybeUninit;
+
+    use rustix::fs::inotify;
+
     use super::*;
     use crate::plan::resolve_preset;
 
@@ -83,5 +88,69 @@ mod tests {
         drop(lock);
         assert!(remove_interrupted_start(&path).unwrap(), "it has no networks");
         assert!(!path.exists());
+    }
+
+    #[test]
+    fn what_an_interrupted_removal_leaves_is_removed_too() {
+        let parent = tempfile::tempdir().unwrap();
+        let path = parent.path().join("run");
+        let mut config = resolve_preset("pendulum").unwrap();
+        config.run.from = Some("another".into());
+        // Directories may be read in the order in which files were made, or the other way round.
+        for configured_first in [true, false] {
+            let make = || {
+                let run = RunDir::create(&path).unwrap();
+                let configure = || {
+                    run.write_config(&config).unwrap();
+                    run.write_used_config(&config).unwrap();
+                };
+                if configured_first {
+                    configure();
+                }
+                for name in ["server.json", "origin.json", "start.json", "replay.bin", "shoal.log"] {
+                    std::fs::write(path.join(name), "").unwrap();
+                }
+                std::fs::create_dir(run.checkpoints()).unwrap();
+                std::fs::write(run.checkpoints().join("latest.ckpt"), "").unwrap();
+                if !configured_first {
+                    configure();
+                }
+                run
+            };
+            let order = order_of_removal(&make());
+            assert_eq!(order.len(), 8, "{order:?}");
+            for removed in 1..=order.len() {
+                make();
+                for name in &order[..removed] {
+                    let entry = path.join(name);
+                    let is_directory = entry.is_dir();
+                    let remove = if is_directory {
+                        std::fs::remove_dir_all
+                    } else {
+                        std::fs::remove_file
+                    };
+                    remove(&entry).unwrap();
+                }
+                let left = &order[removed..];
+                assert!(remove_interrupted_start(&path).unwrap(), "{left:?}");
+                assert!(!path.exists(), "{left:?}");
+            }
+        }
+    }
+
+    /// Removes the run. Returns what was in its directory, in the order in which it was removed.
+    fn order_of_removal(run: &RunDir) -> Vec<String> {
+        let watch = inotify::init(inotify::CreateFlags::NONBLOCK).unwrap();
+        inotify::add_watch(&watch, run.path(), inotify::WatchFlags::DELETE).unwrap();
+        run.remove().unwrap();
+        assert!(!run.path().exists());
+        let mut buffer = [MaybeUninit::uninit(); 4096];
+        let mut events = inotify::Reader::new(watch, &mut buffer);
+        let mut removed = Vec::new();
+        while let Ok(event) = events.next() {
+            // The directory's own end has no name.
+            removed.extend(event.file_name().map(|name| name.to_str().unwrap().to_owned()));
+        }
+        removed
     }
 }

@@ -99,7 +99,7 @@ impl Plan {
         };
         let (lock, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
-            let _ = std::fs::remove_dir_all(run.path());
+            let _ = run.remove();
         })?;
         let of_rows = beginning.and_then(|beginning| beginning.warning(&config));
         Ok(Self {

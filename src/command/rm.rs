@@ -69,7 +69,7 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
             remove_replay(run)?;
             writeln!(std::io::stdout(), "removed the replay of {here} ({})", mebibytes(*size))?;
         } else {
-            remove(run.path()).with_context(|| format!("cannot remove {here}"))?;
+            run.remove().with_context(|| format!("cannot remove {here}"))?;
             writeln!(std::io::stdout(), "removed {here} ({})", mebibytes(*size))?;
         }
     }
@@ -138,24 +138,6 @@ fn remove_replay(run: &RunDir) -> anyhow::Result<()> {
     std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
     launcher::note(run, "`shoal rm --replay` has removed the replay");
     Ok(())
-}
-
-/// Removes a run directory, `config.toml` last: if this is interrupted, the rest is still a run that can be removed.
-fn remove(directory: &Path) -> std::io::Result<()> {
-    let config = directory.join("config.toml");
-    for entry in std::fs::read_dir(directory)? {
-        let entry = entry?;
-        if entry.path() == config {
-            continue;
-        }
-        if entry.file_type()?.is_dir() {
-            std::fs::remove_dir_all(entry.path())?;
-        } else {
-            std::fs::remove_file(entry.path())?;
-        }
-    }
-    std::fs::remove_file(config)?;
-    std::fs::remove_dir(directory)
 }
 
 /// Bytes of all files below the directory.

@@ -107,7 +107,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         if let Ok(_lock) = run.lock()
             && !run.incarnations().exists()
         {
-            let _ = std::fs::remove_dir_all(run.path());
+            let _ = run.remove();
         }
         return begun;
     }
@@ -115,7 +115,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         // If no process was started, the directory is removed, so that its name is free again. By now the path may
         // belong to somebody else.
         if lock.check(&run).is_ok() && !run.incarnations().exists() {
-            let _ = std::fs::remove_dir_all(run.path());
+            let _ = run.remove();
         }
     })
 }
