@@ -6,6 +6,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
 use super::{Suite, Trial, lock};
+use crate::interrupted_start::remove_interrupted_start;
 use crate::plan::{self, RequestedChanges, Revision, RunOverrides};
 use crate::usage::UsageError;
 
@@ -23,7 +24,7 @@ pub fn change(directory: &Path, changes: &[String]) -> anyhow::Result<()> {
     suite.change(changes).map_err(UsageError)?;
     for trial in &suite.trials {
         let path = directory.join(&trial.name);
-        if path.exists() {
+        if !remove_interrupted_start(&path)? {
             let run = RunDir::open(&path)?;
             Revision::new(&run, &run.config()?, &requested(&suite))?;
         }
@@ -89,4 +90,22 @@ pub(super) fn overrides_of(suite: &Suite, trial: &Trial) -> anyhow::Result<RunOv
         set: set.cloned().collect(),
         ..common
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_suite_is_changed_although_the_start_of_a_run_was_interrupted() {
+        let suite = Suite::new("pendulum".into(), vec![], &[], &[1, 2]).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        suite.write(directory.path()).unwrap();
+        let interrupted = directory.path().join(&suite.trials[1].name);
+        std::fs::create_dir(&interrupted).unwrap();
+        std::fs::write(interrupted.join("config.toml.new"), "").unwrap();
+        change(directory.path(), &["ddpg.tau=0.004".into()]).unwrap();
+        assert_eq!(Suite::open(directory.path()).unwrap().changes, ["ddpg.tau=0.004"]);
+        assert!(!interrupted.exists());
+    }
 }
