@@ -118,8 +118,24 @@ pub(crate) fn run(
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let ended = run_and_renew(config, (run, lock), signals, options);
-    if let Err(error) = &ended
-        && lock.check(run).is_ok()
+    ended.inspect_err(|error| record_failed_start((run, lock), error))
+}
+
+/// Waits until the roles of an earlier launcher, which was killed, have ended. Until then they may read and write the
+/// run's files.
+///
+/// # Errors
+/// When some do not end. That is recorded as the run's outcome.
+pub(crate) fn wait_for_predecessors(run_id: &str, (run, lock): (&RunDir, &RunLock)) -> anyhow::Result<()> {
+    let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END);
+    waited
+        .map_err(|error| explain(error, run))
+        .inspect_err(|error| record_failed_start((run, lock), error))
+}
+
+/// Records that the run has failed, unless a launcher has recorded how it ended.
+fn record_failed_start((run, lock): (&RunDir, &RunLock), error: &anyhow::Error) {
+    if lock.check(run).is_ok()
         && let Ok(Some(outcome)) = RunOutcome::read(run)
         && outcome.state == RunState::Running
     {
@@ -129,7 +145,6 @@ pub(crate) fn run(
         // An error here must not hide the original one.
         let _ = failed.write(run);
     }
-    ended
 }
 
 /// Runs all roles, again and again while their shared memory must be made anew.
@@ -172,7 +187,7 @@ fn run_once(
     let starts =
         RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(OutcomeReason::Starting);
     starts.write(run)?;
-    Domain::wait_for_earlier_processes(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
+    wait_for_predecessors(&config.run.id, (run, lock))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = preflight::reserve(&config, run, &domain)

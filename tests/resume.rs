@@ -4,11 +4,13 @@
 
 mod support;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::FileExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
+use shoal_common::channel::Domain;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use support::{Running, Workplace, error_line, parse, until};
@@ -77,6 +79,51 @@ fn a_run_whose_launcher_was_killed_can_be_resumed_at_once() {
             "actor {actor} sent {sent}, {committed} are there"
         );
     }
+}
+
+#[test]
+fn resume_changes_nothing_before_the_last_role_of_a_killed_launcher_has_ended() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    let run = running.run.clone();
+    wait_for_checkpoints(&running);
+    // This process stands for a role that does not end. A stopped one would not do: the system continues it when its
+    // launcher dies.
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let role = Domain::join(&config.run.id, config.actors.max).unwrap();
+    running.kill_all();
+
+    let steps = (rows(&run) + 500).to_string();
+    let change = ["--steps", &steps, "--set", "evaluation.episodes=3"];
+    let before = contents(&run);
+    let message = error_line(&place.output(&[&["resume", "run"], &change[..]].concat()));
+    let advice = format!("still alive and do not end (stopped?): kill -9 {}", std::process::id());
+    assert!(message.contains(&advice), "{message}");
+    let after = contents(&run);
+    let changed = before.iter().chain(&after).map(|(path, _)| path);
+    let changed: BTreeSet<&PathBuf> = changed.filter(|path| before.get(*path) != after.get(*path)).collect();
+    // It says why the run was not started.
+    assert_eq!(changed, BTreeSet::from([&run.join("outcome.json")]));
+
+    role.leave().unwrap();
+    let (code, _, leftovers) = place.resume("run", &change).wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+}
+
+/// The files in a directory, at any depth, with their bytes.
+fn contents(directory: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(directory).unwrap().map(Result::unwrap) {
+        let path = entry.path();
+        if path.is_dir() {
+            found.append(&mut contents(&path));
+        } else {
+            let bytes = std::fs::read(&path).unwrap();
+            found.insert(path, bytes);
+        }
+    }
+    found
 }
 
 #[test]

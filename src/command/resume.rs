@@ -89,6 +89,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     // Only the holder of the lock may change the configuration.
     let lock = run.lock()?;
     let used = run.config()?;
+    launcher::wait_for_predecessors(&used.run.id, (&run, &lock))?;
     let here = args.run.display();
     if run.replay_removed().exists() && !run.replay_file().exists() {
         bail!(
