@@ -54,8 +54,8 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct GateConnection(Session);
 
-/// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own. If it is
-/// dropped, the host leaves and its actors are free.
+/// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own. If it
+/// is dropped, the host leaves and its actors are free.
 #[derive(Debug)]
 pub struct LeaseKeeper {
     /// `None` if nobody waits for its end.

@@ -248,8 +248,8 @@ mod with_network {
         } = host;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
-        // The environment may take minutes to start, and it may not be usable here. Until the relay runs, whatever fails
-        // drops this, and the run has its actors back.
+        // The environment may take minutes to start, and it may not be usable here. Whatever fails before the relay
+        // runs drops this, and the run has its actors back.
         let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
         let interrupt = signals.interrupt();
         if let Some(signal) = interrupt.signal() {
@@ -286,8 +286,8 @@ mod with_network {
         }))
     }
 
-    /// Removes the temporary directories of hosts that were killed, with their copies of the key. A directory with a
-    /// configuration was locked by its host before the configuration was written, and is locked as long as the host lives.
+    /// Removes the temporary directories of hosts that were killed, with their copies of the key. A host locks its
+    /// directory before it writes the configuration, and as long as it lives.
     fn remove_abandoned(temporary: &Path) {
         let user = rustix::process::getuid().as_raw();
         let is_number = |text: &str| text.len() == 16 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
