@@ -20,14 +20,14 @@ mod supervisor;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
+use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RUN_IS_ENDING, RunStatus};
 use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
-use shoal_common::config::Config;
+use shoal_common::config::{Config, Mode};
 use shoal_common::message::one_line;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::role::Role;
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_common::stop::GRACE;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
@@ -35,8 +35,8 @@ use shoal_run::records::recorder::Recorder;
 use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
 
-pub(crate) use self::cleaner::work as clean_up;
-use self::end_roles::EndRoles;
+pub(crate) use self::cleaner::run_in_child as run_clean_up;
+use self::end_roles::{EndRequest, EndRoles};
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
@@ -54,21 +54,15 @@ const LOW_FILL: f64 = 0.1;
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
 const LAST_EVALUATION_REPORT: Duration = Duration::from_secs(1);
 
-/// How long to wait for a learner, or a relay, that is being restarted when the run is requested to end.
-const RESTART: Duration = Duration::from_secs(5);
-
 /// How long actors of a run that is stopped wait until everything is committed, even while there is no learner.
 const ACTORS_HAND_OVER: Duration = Duration::from_secs(2);
-/// How long actors may take then, or in another run, to send their last chunks.
+/// How long actors may take to end after that. In a run that was not stopped, this is all the time they have.
 const ACTORS_END: Duration = Duration::from_secs(3);
 /// How long the other roles may take to end. The learner saves its state in this time.
 const OTHERS_END: Duration = Duration::from_secs(15);
 
 /// How long the gate may take to let the other hosts hand over their last chunks.
 const GATE_END: Duration = Duration::from_secs(8);
-
-/// How many gates may try to. One may be killed meanwhile.
-const GATES: usize = 3;
 
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
@@ -113,12 +107,12 @@ pub(crate) struct RunOptions {
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
 pub(crate) fn run(
     config: Config,
-    (run, lock): (&RunDir, &RunLock),
+    run: &LockedRun,
     signals: &Signals,
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
-    let ended = run_and_renew(config, (run, lock), signals, options);
-    ended.inspect_err(|error| record_failed_start((run, lock), error))
+    let ended = run_and_renew(config, run, signals, options);
+    ended.inspect_err(|error| record_failed_start(run, error))
 }
 
 /// Waits until the roles of an earlier launcher, which was killed, have ended. Until then they may read and write the
@@ -126,16 +120,16 @@ pub(crate) fn run(
 ///
 /// # Errors
 /// When some do not end. That is recorded as the run's outcome.
-pub(crate) fn wait_for_predecessors(run_id: &str, (run, lock): (&RunDir, &RunLock)) -> anyhow::Result<()> {
+pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Result<()> {
     let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END);
     waited
-        .map_err(|error| explain(error, run))
-        .inspect_err(|error| record_failed_start((run, lock), error))
+        .map_err(|error| name_original_run(error, run))
+        .inspect_err(|error| record_failed_start(run, error))
 }
 
 /// Records that the run has failed, unless a launcher has recorded how it ended.
-fn record_failed_start((run, lock): (&RunDir, &RunLock), error: &anyhow::Error) {
-    if lock.check(run).is_ok()
+fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
+    if run.check().is_ok()
         && let Ok(Some(outcome)) = RunOutcome::read(run)
         && outcome.state == RunState::Running
     {
@@ -150,13 +144,13 @@ fn record_failed_start((run, lock): (&RunDir, &RunLock), error: &anyhow::Error) 
 /// Runs all roles, again and again while their shared memory must be made anew.
 fn run_and_renew(
     mut config: Config,
-    (run, lock): (&RunDir, &RunLock),
+    run: &LockedRun,
     signals: &Signals,
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, (run, lock), signals, options)?;
+        let outcome = run_once(config, run, signals, options)?;
         wall += outcome.wall;
         let before = before.get_or_insert(outcome.before.clone());
         if outcome.ending != RunEnd::Renewed {
@@ -179,7 +173,7 @@ fn run_and_renew(
 
 fn run_once(
     config: Config,
-    (run, lock): (&RunDir, &RunLock),
+    run: &LockedRun,
     signals: &Signals,
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
@@ -187,11 +181,11 @@ fn run_once(
     let starts =
         RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(OutcomeReason::Starting);
     starts.write(run)?;
-    wait_for_predecessors(&config.run.id, (run, lock))?;
+    wait_for_predecessors(&config.run.id, run)?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = preflight::reserve(&config, run, &domain)
-        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, options))
+        .and_then(|()| Launcher::new(config, run, &domain, signals, options))
         .and_then(Launcher::run);
     // Also after an error: no role is left by now.
     let left = domain.leave();
@@ -200,8 +194,8 @@ fn run_once(
     Ok(outcome)
 }
 
-/// Adds to the error to which run the processes belong that are still alive.
-fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
+/// If the surviving processes belong to a run that this directory is a copy of, names that run in the error.
+fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
     let DomainError::StillAlive { pids, .. } = &error else {
         return error.into();
     };
@@ -225,32 +219,17 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     }
 }
 
-/// A request to end the run.
-#[derive(Clone, Copy, Debug)]
-struct EndRequest {
-    at: Instant,
-    ending: RunEnd,
-}
-
-impl EndRequest {
-    fn new(ending: RunEnd) -> Self {
-        let at = Instant::now();
-        Self { at, ending }
-    }
-}
-
 struct Launcher<'a> {
     config: Config,
-    run: &'a RunDir,
-    lock: &'a RunLock,
+    run: &'a LockedRun,
     domain: &'a Domain,
     control: ControlPort,
     /// The run's status when this launcher started.
     initial: RunStatus,
     /// The first request to end the run.
-    end_request: Option<EndRequest>,
+    end_request: Option<EndRequest<RunEnd>>,
     /// Whether the roles are being ended.
-    ending: bool,
+    is_ending: bool,
     supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
@@ -268,7 +247,7 @@ struct Launcher<'a> {
 impl<'a> Launcher<'a> {
     fn new(
         config: Config,
-        (run, lock): (&'a RunDir, &'a RunLock),
+        run: &'a LockedRun,
         domain: &'a Domain,
         signals: &'a Signals,
         RunOptions { quiet, gate }: RunOptions,
@@ -289,9 +268,8 @@ impl<'a> Launcher<'a> {
             control: ControlPort::open(domain)?,
             initial,
             end_request: None,
-            ending: false,
+            is_ending: false,
             run,
-            lock,
             domain,
             heartbeats: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
@@ -311,9 +289,10 @@ impl<'a> Launcher<'a> {
 
     fn run(mut self) -> anyhow::Result<TrainingOutcome> {
         let mut ending = self.watch();
-        if self.lock.check(self.run).is_err() {
-            // The run's directory is gone, so the roles cannot save anything. By now, another run may be at this path.
+        if let Err(gone) = self.run.check() {
+            // The roles cannot save anything. By now, another run may be at this path, so none may be started either.
             self.supervisor.kill(|_| true);
+            ending = Err(gone.into());
         }
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
@@ -321,7 +300,7 @@ impl<'a> Launcher<'a> {
         if matches!(ending, Ok(RunEnd::Renewed))
             && let Some(request) = self.end_request
         {
-            ending = Ok(request.ending);
+            ending = Ok(request.end);
         }
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
@@ -330,8 +309,8 @@ impl<'a> Launcher<'a> {
         });
         // If the directory is gone, all other errors follow from that, and nothing may be written at its path. The open
         // log is still the run's own.
-        self.lock
-            .check(self.run)
+        self.run
+            .check()
             .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;
         let renewed = matches!(ending, Ok(RunEnd::Renewed));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
@@ -372,17 +351,16 @@ impl<'a> Launcher<'a> {
     fn watch(&mut self) -> anyhow::Result<RunEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
-            if let Some(signal) = self.signals.received()
-                && self.end_request.is_none()
-            {
-                self.log
-                    .note("launcher", &format!("{} ends the run", signals::describe(signal)));
-                self.end_request = Some(EndRequest::new(RunEnd::Interrupted(signal)));
-            }
-            self.lock.check(self.run)?;
+            self.take_signal();
+            self.run.check()?;
             self.read_reports()?;
             self.answer_requests()?;
-            match self.supervisor.maintain(self.domain)? {
+            let condition = match (self.supervisor.maintain(self.domain), self.end_request) {
+                // A run that is about to end needs no role that cannot work.
+                (Err(_), Some(request)) => return Ok(request.end),
+                (condition, _) => condition?,
+            };
+            match condition {
                 supervisor::RunCondition::AtWork => {}
                 supervisor::RunCondition::LearnerDone => {
                     self.await_last_evaluation()?;
@@ -391,7 +369,7 @@ impl<'a> Launcher<'a> {
                 supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
                     if self.end_request.is_some() => {}
                 supervisor::RunCondition::SharedMemoryOccupied => {
-                    return Ok(self.renew("dead processes occupy shared memory for good"));
+                    return Ok(self.report_renewal("dead processes occupy shared memory for good"));
                 }
                 supervisor::RunCondition::FilesRemoved => {
                     let directory = self.domain.directory()?;
@@ -399,30 +377,35 @@ impl<'a> Launcher<'a> {
                         "another program has removed files of this run in {}",
                         directory.display()
                     );
-                    return Ok(self.renew(&what));
+                    return Ok(self.report_renewal(&what));
                 }
             }
-            for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
-                self.log.note("launcher", &stalled);
-                self.progress.print(&stalled);
+            for message in self.supervisor.check_progress(&mut self.stalls) {
+                self.progress.print(&message);
             }
-            for slow in self.supervisor.report_slow(&self.stalls) {
-                self.log.note("launcher", &slow);
-                self.progress.print(&slow);
-            }
-            // A learner that has just died is restarted first, so that it takes in what the actors have sent.
-            if let Some(EndRequest { at, ending }) = self.end_request
-                && (self.supervisor.is_ready(Role::Learner) || at.elapsed() >= RESTART)
+            if let Some(request) = self.end_request
+                && request.may_begin(&self.supervisor, Role::Learner)
             {
-                return Ok(ending);
+                return Ok(request.end);
             }
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.time_to_next_task()));
         }
     }
 
-    /// Says why the run continues in new shared memory.
-    fn renew(&self, why: &str) -> RunEnd {
+    /// Takes a signal that has come as a request to end the run.
+    fn take_signal(&mut self) {
+        if let Some(signal) = self.signals.received()
+            && self.end_request.is_none()
+        {
+            self.log
+                .note("launcher", &format!("{} ends the run", signals::describe(signal)));
+            self.end_request = Some(EndRequest::new(RunEnd::Interrupted(signal)));
+        }
+    }
+
+    /// Logs and prints why the run continues in new shared memory. Returns [`RunEnd::Renewed`].
+    fn report_renewal(&self, why: &str) -> RunEnd {
         let why = format!("{why}: the run continues in new shared memory");
         self.log.note("launcher", &why);
         self.progress.print(&why);
@@ -432,8 +415,8 @@ impl<'a> Launcher<'a> {
     /// Waits for the report on the last period's policy.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
         let last = status::saved_status(&self.config, self.run)?.env_steps;
-        let patience = Instant::now();
-        while patience.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
+        let begun = Instant::now();
+        while begun.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
             self.read_reports()?;
             self.answer_requests()?;
             let period = |steps| self.config.evaluation.period(steps);
@@ -446,43 +429,52 @@ impl<'a> Launcher<'a> {
     }
 
     /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over, or is
-    /// requested to end meanwhile, the other hosts are told so. Otherwise they are told nothing, and wait.
+    /// requested to end meanwhile, the other hosts are told so. Otherwise, and after an error, which `None` stands for,
+    /// they are told nothing, and wait.
     fn end_all(&mut self, ending: Option<RunEnd>) -> anyhow::Result<()> {
-        self.ending = true;
+        self.is_ending = true;
         let was_asked = matches!(ending, Some(RunEnd::Stopped | RunEnd::Interrupted(_)));
         let receiver = was_asked.then_some(Role::Learner);
-        if was_asked {
+        // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
+        if was_asked && self.config.run.mode == Mode::Free {
             self.supervisor.ask_to_retire(Role::Actor);
             self.have_ended_within(ACTORS_HAND_OVER, |role| role == Role::Actor, receiver);
         }
         self.supervisor.ask_to_end(|role| role == Role::Actor);
         self.await_end(|role| role == Role::Actor, ACTORS_END, receiver);
-        let are_told = was_asked || ending == Some(RunEnd::Finished) || self.end_request.is_some();
-        if are_told {
-            // They hand over what they have while the learner is still there.
-            self.tell_hosts(receiver)?;
-        }
+        self.take_signal();
+        let is_over = |end_request: Option<_>| match ending {
+            Some(RunEnd::Renewed) => end_request.is_some(),
+            Some(_) => true,
+            None => false,
+        };
+        let are_told = is_over(self.end_request);
+        // They hand over what they have while the learner is still there.
+        let mut told = if are_told { self.tell_hosts(receiver) } else { Ok(()) };
         self.supervisor.ask_to_end(|_| true);
         self.await_end(|_| true, OTHERS_END, None);
-        if !are_told && self.end_request.is_some() {
-            self.tell_hosts(None)?;
+        self.take_signal();
+        if !are_told && is_over(self.end_request) {
+            told = self.tell_hosts(None);
         }
         self.read_reports()?;
-        self.supervisor.check_saved()
+        self.supervisor.check_saved()?;
+        told
     }
 
     /// Tells the other hosts that the run is over. A gate that has just died, or dies meanwhile, is started again for
     /// that.
     fn tell_hosts(&mut self, receiver: Option<Role>) -> anyhow::Result<()> {
-        for _ in 0..GATES {
+        let deadline = Instant::now() + GATE_END;
+        loop {
             self.supervisor.ensure_gate(self.domain)?;
             self.supervisor.ask_to_retire(Role::Gate);
-            self.await_end(|role| role == Role::Gate, GATE_END, receiver);
-            if !self.supervisor.has_failed(Role::Gate) {
-                break;
+            let left = deadline.saturating_duration_since(Instant::now());
+            self.await_end(|role| role == Role::Gate, left, receiver);
+            if !self.supervisor.has_failed(Role::Gate) || Instant::now() >= deadline {
+                return Ok(());
             }
         }
-        Ok(())
     }
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
@@ -533,14 +525,14 @@ impl EndRoles for Launcher<'_> {
             supervisor,
             progress,
             initial,
-            ending,
+            is_ending,
             end_request,
             log,
             domain,
             ..
         } = self;
         control.answer_requests(
-            run.key()?,
+            run.directory_id()?,
             run.path(),
             |request| -> anyhow::Result<Option<ControlResponse>> {
                 match request {
@@ -550,12 +542,12 @@ impl EndRoles for Launcher<'_> {
                             Err(error) => ControlResponse::Refused(error.to_string()),
                         },
                     )),
-                    ControlRequest::Scale { .. } if *ending => {
-                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
+                    ControlRequest::Scale { .. } if *is_ending => {
+                        Ok(Some(ControlResponse::Refused(RUN_IS_ENDING.into())))
                     }
                     ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
-                    ControlRequest::Admit(_) if *ending || end_request.is_some() => {
-                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
+                    ControlRequest::Admit(_) if *is_ending || end_request.is_some() => {
+                        Ok(Some(ControlResponse::Refused(RUN_IS_ENDING.into())))
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
                     ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),

@@ -91,7 +91,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Relay(args) => role::run(Role::Relay, args),
         Command::Tied(args) => shoal_run::child_process::exec_tied(args.parent, &args.program),
         Command::InNewSession(args) => command::detach::exec_in_new_session(&args.arguments),
-        Command::CleanUp(args) => launcher::clean_up(args.launcher, &args.run_id),
+        Command::CleanUp(args) => launcher::run_clean_up(args.launcher, &args.run_id),
     }
 }
 

@@ -206,6 +206,10 @@ fn a_learner_killed_just_before_a_signal_is_replaced_before_the_run_ends() {
     let (code, ..) = running.wait();
     assert_eq!(code, Some(128 + 15), "{}", place.stderr());
     support::assert_all_rows_committed(&run, 2);
+    let incidents = std::fs::read_to_string(run.join("incidents.csv")).unwrap();
+    for what in ["learner,0,killed", "learner,0,started-again"] {
+        assert_eq!(incidents.matches(what).count(), 1, "{incidents}");
+    }
 }
 
 #[test]

@@ -55,7 +55,7 @@ pub struct ActorSettings {
     /// The layout of a chunk.
     pub chunk: ChunkLayout,
     /// Whether the first policy comes from another run (`--from`).
-    pub has_learned: bool,
+    pub starts_with_learned_policy: bool,
     /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
 }
@@ -69,7 +69,7 @@ impl ActorSettings {
             envs: config.actors.envs as usize,
             n_step: config.replay.n_step as usize,
             chunk: config.chunk_layout(),
-            has_learned: config.run.from.is_some(),
+            starts_with_learned_policy: config.run.from.is_some(),
             replay: run.replay_file(),
         }
     }
@@ -344,7 +344,7 @@ impl<'a> Actor<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, policy: &PublishedPolicy, current: &EnvironmentResponse) {
         let act = match policy.header().updates {
-            0 if !self.settings.has_learned => Exploration::warm_up,
+            0 if !self.settings.starts_with_learned_policy => Exploration::warm_up,
             _ => Exploration::act,
         };
         let steps = StepCounts {

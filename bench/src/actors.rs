@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::costs::{self, Costs};
-use super::intervals::IntervalResults;
+use super::intervals::Samples;
 use super::measurement::{Figures, TimeBudget};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
@@ -71,7 +71,7 @@ struct Rate {
     expected_rows_per_second: f64,
     expected_updates_per_second: f64,
     #[serde(skip)]
-    results: IntervalResults,
+    results: Samples,
 }
 
 /// The model's prediction when every process has a core of its own.
@@ -134,7 +134,7 @@ pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Resul
         None => bail!("nothing was counted"),
     };
     let counts = counted.into_iter().map(|(actors, collecting, learning)| {
-        let rate = |(results, updates): (IntervalResults, f64), one: f64, with_updates| {
+        let rate = |(results, updates): (Samples, f64), one: f64, with_updates| {
             let expected = stages.on_cores(cores, actors, with_updates);
             Rate {
                 rows_per_second: results.median(),
@@ -182,7 +182,7 @@ fn scaling(stages: &Stages, actors: u32, rows: f64) -> Scaling {
 }
 
 /// The rate of committed rows with `actors` actors in each interval, and the learner's gradient steps per second.
-fn count(actors: u32, updates: bool, length: Duration, budget: &TimeBudget) -> anyhow::Result<(IntervalResults, f64)> {
+fn count(actors: u32, updates: bool, length: Duration, budget: &TimeBudget) -> anyhow::Result<(Samples, f64)> {
     let temporary = TemporaryRun::of(actors, ENVIRONMENTS as u32, &settings_for_counting(actors, updates))?;
     temporary.with_processes(
         |_| None,
@@ -199,8 +199,8 @@ fn watch(
     length: Duration,
     processes: &mut Processes,
     budget: &TimeBudget,
-) -> anyhow::Result<(IntervalResults, f64)> {
-    let mut results = IntervalResults::default();
+) -> anyhow::Result<(Samples, f64)> {
+    let mut results = Samples::default();
     let mut published: Vec<(Instant, u64)> = Vec::new();
     let (begun, mut opened) = (Instant::now(), (Instant::now(), progress.rows()));
     let interval = INTERVAL.min(length);

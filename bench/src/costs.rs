@@ -20,7 +20,7 @@ use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::child_process::ChildProcess;
 
-use super::intervals::{self, IntervalResults};
+use super::intervals::{self, Samples};
 use super::measurement::{TimeBudget, interrupted};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::temporary_run::{TemporaryRun, ddpg};
@@ -130,7 +130,7 @@ pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<C
 fn microseconds(length: Duration, budget: &TimeBudget, mut work: impl FnMut()) -> anyhow::Result<f64> {
     let part = length / (INTERVALS + 1);
     intervals::rate(part, &mut work);
-    let mut results = IntervalResults::default();
+    let mut results = Samples::default();
     for _ in 0..INTERVALS {
         budget.check()?;
         results.add(1e6 / intervals::rate(part, &mut work));
@@ -174,7 +174,7 @@ fn round_trip(
         .map_err(interrupted)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let part = length / (INTERVALS + 1);
-    let mut results = IntervalResults::default();
+    let mut results = Samples::default();
     for interval in 0..=INTERVALS {
         budget.check()?;
         server.check()?;
@@ -222,7 +222,7 @@ fn chunks(
         .wait(&commits, &listener, &budget.stop, || {})
         .map_err(interrupted)?;
 
-    let (mut writing, mut taking_in) = (IntervalResults::default(), IntervalResults::default());
+    let (mut writing, mut taking_in) = (Samples::default(), Samples::default());
     let begun = Instant::now();
     // The first pass over the replay measures page faults, so it does not count.
     while replay.head() < config.replay.capacity || writing.is_empty() || begun.elapsed() < length {

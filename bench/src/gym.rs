@@ -70,15 +70,15 @@ fn times(
     length: Duration,
     budget: &TimeBudget,
 ) -> anyhow::Result<Vec<u32>> {
-    let mut conversation = ExternalEnvironment::begin(environment, environments, 1)?;
-    conversation.begin_evaluation(0)?;
-    let actions = vec![0.5; environments as usize * conversation.spec().action.width()];
+    let mut client = ExternalEnvironment::begin(environment, environments, 1)?;
+    client.begin_evaluation(0)?;
+    let actions = vec![0.5; environments as usize * client.spec().action.width()];
     let begun = Instant::now();
     let mut times = Vec::new();
     while times.is_empty() || begun.elapsed() < length {
         budget.check()?;
         let before = Instant::now();
-        conversation.step(&actions)?;
+        client.step(&actions)?;
         if begun.elapsed() >= length.mul_f64(WARM_UP) {
             times.push(before.elapsed().as_nanos().try_into().unwrap_or(u32::MAX));
         }

@@ -20,14 +20,14 @@ pub(super) fn rate(length: Duration, mut work: impl FnMut()) -> f64 {
     }
 }
 
-/// The sorted results of intervals. The median is the result; the extremes show how quiet the machine was.
+/// Sorted samples. The median is the result; the extremes show how quiet the machine was.
 #[derive(Clone, Debug, Default)]
-pub(super) struct IntervalResults(Vec<f64>);
+pub(super) struct Samples(Vec<f64>);
 
-impl IntervalResults {
-    pub(super) fn add(&mut self, rate: f64) {
-        let place = self.0.partition_point(|other| *other < rate);
-        self.0.insert(place, rate);
+impl Samples {
+    pub(super) fn add(&mut self, value: f64) {
+        let place = self.0.partition_point(|other| *other < value);
+        self.0.insert(place, value);
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn the_median_is_the_middle_of_the_sorted_rates() {
-        let mut results = IntervalResults::default();
+        let mut results = Samples::default();
         [5.0, 1.0, 4.0, 2.0, 3.0].into_iter().for_each(|rate| results.add(rate));
         assert_eq!((results.least(), results.median(), results.greatest()), (1.0, 3.0, 5.0));
         assert_eq!(results.show(1.0, 1), "3.0 (1.0 to 5.0)");

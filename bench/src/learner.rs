@@ -14,7 +14,7 @@ use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
 use toml::{Table, Value};
 
-use super::intervals::{self, IntervalResults};
+use super::intervals::{self, Samples};
 use super::measurement::{Figures, TimeBudget};
 use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
@@ -42,17 +42,17 @@ pub(super) struct LearnerFigures {
     #[serde(rename = "method")]
     algorithm: String,
     #[serde(flatten)]
-    configured: Figure,
+    configured: BatchFigures,
     /// Missing if the configured minibatches have this size.
     #[serde(skip_serializing_if = "Option::is_none")]
-    large_batch: Option<Figure>,
+    large_batch: Option<BatchFigures>,
     two_threads: TwoThreads,
     replay_rows: u64,
 }
 
 /// The results for one minibatch size, on one thread. An update is one gradient step of every network.
 #[derive(Serialize)]
-struct Figure {
+struct BatchFigures {
     batch: usize,
     updates_per_second: f64,
     /// Counts the matrix products only.
@@ -66,11 +66,11 @@ struct Figure {
     products_gflops: f64,
     share_of_products: f64,
     #[serde(skip)]
-    updates: IntervalResults,
+    updates: Samples,
     #[serde(skip)]
-    limit: IntervalResults,
+    limit: Samples,
     #[serde(skip)]
-    products: IntervalResults,
+    products: Samples,
 }
 
 /// The configured minibatch size, on two threads.
@@ -80,7 +80,7 @@ struct TwoThreads {
     /// Relative to one thread.
     speedup: f64,
     #[serde(skip)]
-    updates: IntervalResults,
+    updates: Samples,
 }
 
 /// Measures one of the [algorithms](super::algorithms), by default DDPG.
@@ -96,15 +96,15 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
     let mut large = (batch != LARGE_BATCH)
         .then(|| Case::new(&config, LARGE_BATCH))
         .transpose()?;
-    let mut shared = learner(&config, batch)?;
+    let mut shared = new_algorithm(&config, batch)?;
     shared.set_threads(Threads::two_threads()?);
-    let mut updates_of_two = IntervalResults::default();
+    let mut updates_of_two = Samples::default();
     let cases = [&mut configured]
         .into_iter()
         .chain(&mut large)
-        .map(|case| &mut case.learner);
-    for learner in cases.chain([&mut shared]) {
-        intervals::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
+        .map(|case| &mut case.algorithm);
+    for algorithm in cases.chain([&mut shared]) {
+        intervals::rate(budget.length.mul_f64(WARM_UP), || update(algorithm, &replay));
     }
     for _ in 0..intervals::count(budget.length, SHARE, INTERVAL) {
         budget.check()?;
@@ -153,61 +153,61 @@ fn filled(config: &Config, mut replay: Replay, budget: &TimeBudget) -> anyhow::R
     Ok(replay)
 }
 
-/// A new learner with minibatches of `batch` rows.
-fn learner(config: &Config, batch: usize) -> anyhow::Result<Box<dyn Algorithm>> {
+/// The run's algorithm with minibatches of `batch` rows.
+fn new_algorithm(config: &Config, batch: usize) -> anyhow::Result<Box<dyn Algorithm>> {
     Ok(registry::new(&with_batch(config, batch)?)?)
 }
 
 /// One gradient step, as in the learner's loop.
-fn update(learner: &mut Box<dyn Algorithm>, replay: &Replay) {
-    std::hint::black_box(learner.update(replay, replay.head()));
+fn update(algorithm: &mut Box<dyn Algorithm>, replay: &Replay) {
+    std::hint::black_box(algorithm.update(replay, replay.head()));
 }
 
 /// The measurement of one minibatch size.
 struct Case {
-    learner: Box<dyn Algorithm>,
+    algorithm: Box<dyn Algorithm>,
     batch: usize,
     flop_per_update: u64,
-    /// The number of updates whose products are in the list.
-    updates_of_list: f64,
-    list: List,
+    /// The number of updates whose products are in the sequence.
+    updates_in_sequence: f64,
+    sequence: ProductSequence,
     fastest: TimedProduct,
-    updates: IntervalResults,
-    limit: IntervalResults,
-    products: IntervalResults,
+    updates: Samples,
+    limit: Samples,
+    products: Samples,
 }
 
 impl Case {
     fn new(config: &Config, batch: usize) -> anyhow::Result<Self> {
         let products = registry::products(&with_batch(config, batch)?);
-        let (list, fastest) = multiplications(config, &products);
+        let (sequence, fastest) = product_sequence(config, &products);
         Ok(Self {
-            learner: learner(config, batch)?,
+            algorithm: new_algorithm(config, batch)?,
             batch,
             flop_per_update: products.flop_per_update(),
-            updates_of_list: products.updates as f64,
-            list,
+            updates_in_sequence: products.updates as f64,
+            sequence,
             fastest,
-            updates: IntervalResults::default(),
-            limit: IntervalResults::default(),
-            products: IntervalResults::default(),
+            updates: Samples::default(),
+            limit: Samples::default(),
+            products: Samples::default(),
         })
     }
 
     /// Adds the result of one interval to each measurement.
     fn measure(&mut self, replay: &Replay) {
-        let flop_of_list = self.flop_per_update as f64 * self.updates_of_list;
+        let flop_of_sequence = self.flop_per_update as f64 * self.updates_in_sequence;
         self.updates
-            .add(intervals::rate(INTERVAL, || update(&mut self.learner, replay)));
+            .add(intervals::rate(INTERVAL, || update(&mut self.algorithm, replay)));
         self.limit.add(self.fastest.gflops(INTERVAL));
         self.products
-            .add(intervals::rate(INTERVAL, || self.list.multiply_all()) * flop_of_list / 1e9);
+            .add(intervals::rate(INTERVAL, || self.sequence.multiply_all()) * flop_of_sequence / 1e9);
     }
 
-    fn figure(self) -> Figure {
+    fn figure(self) -> BatchFigures {
         let flop = self.flop_per_update;
         let achieved = flop as f64 * self.updates.median() / 1e9;
-        Figure {
+        BatchFigures {
             batch: self.batch,
             updates_per_second: self.updates.median(),
             flop_per_update: flop,
@@ -225,12 +225,12 @@ impl Case {
 }
 
 /// An update's products in their order. A repeated shape uses the same matrices again.
-struct List {
+struct ProductSequence {
     distinct: Vec<TimedProduct>,
     order: Vec<usize>,
 }
 
-impl List {
+impl ProductSequence {
     fn multiply_all(&mut self) {
         for &i in &self.order {
             self.distinct[i].multiply();
@@ -239,7 +239,7 @@ impl List {
 }
 
 /// All products, each with its best kernel, and a copy of the fastest one.
-fn multiplications(config: &Config, products: &Products) -> (List, TimedProduct) {
+fn product_sequence(config: &Config, products: &Products) -> (ProductSequence, TimedProduct) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
     let (mut distinct, mut order): (Vec<TimedProduct>, Vec<usize>) = Default::default();
     for &product in &products.products {
@@ -262,10 +262,10 @@ fn multiplications(config: &Config, products: &Products) -> (List, TimedProduct)
     });
     let mut fastest = TimedProduct::new(distinct[best].product, &mut random);
     fastest.kernel = distinct[best].kernel;
-    (List { distinct, order }, fastest)
+    (ProductSequence { distinct, order }, fastest)
 }
 
-impl Figure {
+impl BatchFigures {
     fn lines(&self) -> [(&'static str, String); 4] {
         [
             (
@@ -311,13 +311,13 @@ impl Figures for LearnerFigures {
         let mut lines = vec![("algorithm", self.algorithm.clone())];
         lines.extend(self.configured.lines());
         lines.push(("updates a second", two));
-        lines.extend(self.large_batch.iter().flat_map(Figure::lines));
+        lines.extend(self.large_batch.iter().flat_map(BatchFigures::lines));
         lines.push(("rows in the replay", self.replay_rows.to_string()));
         lines
     }
 
     fn table(&self) -> Vec<Line> {
-        let of = |figure: &Figure, stage, target| Line {
+        let of = |figure: &BatchFigures, stage, target| Line {
             stage,
             ours: format!("{:.0} updates/s", figure.updates_per_second),
             limit: format!(

@@ -10,7 +10,7 @@ use shoal_common::role::Role;
 
 use super::cores::Cores;
 use super::costs::Inference;
-use super::intervals::{self, IntervalResults};
+use super::intervals::{self, Samples};
 use super::measurement::TimeBudget;
 use super::processes::Processes;
 use super::progress::RunProgress;
@@ -63,11 +63,7 @@ fn take_turns(
     inference: &mut Inference,
     budget: &TimeBudget,
 ) -> anyhow::Result<OneCore> {
-    let (mut pair, mut alone, mut shares) = (
-        IntervalResults::default(),
-        IntervalResults::default(),
-        IntervalResults::default(),
-    );
+    let (mut pair, mut alone, mut shares) = (Samples::default(), Samples::default(), Samples::default());
     for _ in 0..turns {
         sched_setaffinity(None, &cores.others)?;
         // The actor and its server have just been resumed.

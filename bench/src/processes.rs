@@ -22,7 +22,7 @@ impl Processes {
                 index,
                 incarnation,
             };
-            let peer = ChildProcess::member(instance, run)?;
+            let peer = ChildProcess::of_instance(instance, run)?;
             if let Some(cores) = cores_for(role) {
                 peer.pin(&cores)?;
             }

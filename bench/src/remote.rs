@@ -14,10 +14,10 @@ use shoal_common::config::RemoteConfig;
 use self::cable::Cable;
 use self::hosts::{Network, RemoteRun};
 use self::model::{Bottleneck, Costs, PolicyAge, policy_age};
-use super::intervals::{self, IntervalResults};
+use super::intervals::{self, Samples};
 use super::measurement::{Figures, TimeBudget};
 use super::memory::Memory;
-use super::temporary_run::TemporaryRun;
+use super::temporary_run::{TemporaryRun, UNDISTURBED};
 
 const INTERVAL: Duration = Duration::from_millis(100);
 
@@ -121,7 +121,7 @@ struct LinkFigures {
     relay_cores: f64,
     learner_cores: f64,
     #[serde(skip)]
-    rates: IntervalResults,
+    rates: Samples,
 }
 
 /// The cable is unplugged and plugged in again.
@@ -192,9 +192,8 @@ fn temporary_run(actors: u32, window: u32) -> anyhow::Result<TemporaryRun> {
             &window,
             &most,
             "replay.updates_per_step=0",
-            "run.steps=1_000_000_000_000",
-            // Writing a checkpoint to disk would disturb the measurement.
-            "checkpoint.every_seconds=86_400",
+            UNDISTURBED[0],
+            UNDISTURBED[1],
         ],
     )
 }
@@ -211,7 +210,7 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
         let busy = || -> anyhow::Result<_> { observed.into_iter().map(usage::busy).collect() };
         let before: Vec<Duration> = busy()?;
         let begun = Instant::now();
-        let mut rates = IntervalResults::default();
+        let mut rates = Samples::default();
         for _ in 0..intervals::count(length, 1.0 - WARM_UP, INTERVAL) {
             let (then, rows) = (Instant::now(), run.rows());
             run.send_for(INTERVAL)?;
@@ -237,7 +236,7 @@ fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> 
     };
     let temporary = temporary_run(ACTORS, WINDOW)?;
     RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
-        let mut returned = IntervalResults::default();
+        let mut returned = Samples::default();
         // Nine for the default length.
         for i in 0..intervals::count(length, 1.0, Duration::from_secs_f64(0.13)) as u32 {
             run.send_for(INTERVAL)?;
@@ -283,7 +282,7 @@ fn predict(
         delay: 0.0,
         window: 1,
     };
-    // A single chunk under way waits for nothing but the delay.
+    // With one chunk in circulation nothing queues, so what exceeds the model's time is the delay.
     let alone = chunks_per_second_at_pace(slow, 1, 1, Duration::ZERO, length, budget)?;
     costs.delay = (1.0 / alone - 1.0 / costs.throughput(1, 1)).max(0.0);
     (costs.think, costs.window) = (FILL_TIME.as_secs_f64(), DEFAULT_WINDOW);

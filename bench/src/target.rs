@@ -37,7 +37,7 @@ impl Target {
         }
     }
 
-    pub(super) fn none(text: &'static str) -> Self {
+    pub(super) fn unchecked(text: &'static str) -> Self {
         Self { text, met: None }
     }
 

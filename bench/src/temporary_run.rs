@@ -74,6 +74,7 @@ impl TemporaryRun {
         };
         let Plan { config, run, .. } = Plan::new(preset, &overrides)?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
+        let run = run.unlock();
         Ok(Self { config, run, directory })
     }
 
@@ -149,15 +150,14 @@ impl TemporaryRun {
     }
 }
 
+/// Assignments for a run that goes on until the measurement is over, and is not disturbed by writing checkpoints.
+pub(super) const UNDISTURBED: [&str; 2] = ["run.steps=1_000_000_000_000", "checkpoint.every_seconds=86_400"];
+
 /// Assignments for a run whose steps are counted.
 pub(super) fn settings_for_counting(actors: u32, updates: bool) -> Vec<&'static str> {
-    let mut settings = vec![
-        "run.steps=1_000_000_000_000",
-        // Writing a checkpoint to disk would disturb the measurement.
-        "checkpoint.every_seconds=86_400",
-        // The model's cost of a gradient step is that of one thread.
-        "learner.threads=1",
-    ];
+    let mut settings = UNDISTURBED.to_vec();
+    // The model's cost of a gradient step is that of one thread.
+    settings.push("learner.threads=1");
     if actors > 16 {
         settings.push("actors.max=256");
     }

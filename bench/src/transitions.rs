@@ -16,11 +16,11 @@ use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
 use shoal_run::child_process::ChildProcess;
 
-use super::intervals::{self, IntervalResults};
+use super::intervals::{self, Samples};
 use super::measurement::{Figures, TimeBudget};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
-use super::temporary_run::{TemporaryRun, ddpg};
+use super::temporary_run::{TemporaryRun, UNDISTURBED, ddpg};
 
 const INTERVAL: Duration = Duration::from_millis(100);
 const SAMPLING_INTERVAL: Duration = Duration::from_millis(20);
@@ -43,19 +43,14 @@ pub(super) struct TransitionFigures {
     replay_rows: u64,
     batch: usize,
     #[serde(skip)]
-    moved: IntervalResults,
+    moved: Samples,
     #[serde(skip)]
-    sampled: IntervalResults,
+    sampled: Samples,
 }
 
 pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> {
-    let temporary = TemporaryRun::new(&[
-        "actors.chunk_steps=64",
-        "replay.updates_per_step=0",
-        "run.steps=1_000_000_000_000",
-        // Writing a checkpoint to disk would disturb the measurement.
-        "checkpoint.every_seconds=86_400",
-    ])?;
+    let own = ["actors.chunk_steps=64", "replay.updates_per_step=0"];
+    let temporary = TemporaryRun::new(&[&own[..], &UNDISTURBED].concat())?;
     let moved = temporary.with_peer(Role::Learner, |domain, learner| {
         move_rows(&temporary.config, &temporary.run, domain, learner, budget)
     })?;
@@ -81,7 +76,7 @@ fn move_rows(
     domain: &Domain,
     learner: &mut ChildProcess,
     budget: &TimeBudget,
-) -> anyhow::Result<IntervalResults> {
+) -> anyhow::Result<Samples> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
     let mut chunks = vec![vec![0.0; ENVIRONMENTS * row.width()]; CHUNKS];
@@ -101,7 +96,7 @@ fn move_rows(
         .map_err(super::measurement::interrupted)?;
 
     let [warm_up, moving, _] = SHARES;
-    let mut results = IntervalResults::default();
+    let mut results = Samples::default();
     let mut left = intervals::count(budget.length, moving, INTERVAL);
     let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warm_up), None);
     loop {
@@ -133,7 +128,7 @@ fn move_rows(
         let elapsed = begun.elapsed();
         if elapsed >= length {
             let now = commits.rows();
-            // The first window is the warm-up.
+            // The first interval is the warm-up.
             if let Some(before) = committed.replace(now) {
                 results.add((now - before) as f64 / elapsed.as_secs_f64());
                 left -= 1;
@@ -164,7 +159,7 @@ fn wait_for_replay(
 }
 
 /// The rates of rows drawn into minibatches, as the learner does it.
-fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Result<IntervalResults> {
+fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Result<Samples> {
     let sampler = Sampler::new(config.run.seed);
     let size = ddpg(config)?.batch;
     let mut batch = Minibatch::new(config.row_layout(), size);
@@ -179,7 +174,7 @@ fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Resu
     };
     // Warms up: the first access to each page of the new mapping is a page fault.
     intervals::rate(budget.length.mul_f64(SHARES[2] / 4.0), &mut gather);
-    let mut results = IntervalResults::default();
+    let mut results = Samples::default();
     for _ in 0..intervals::count(budget.length, SHARES[2], SAMPLING_INTERVAL) {
         budget.check()?;
         results.add(intervals::rate(SAMPLING_INTERVAL, &mut gather) * size as f64);

@@ -9,7 +9,7 @@ use serde::Serialize;
 use shoal_common::role::Role;
 
 use self::training::{Recovery, Startup, Training};
-use super::intervals::IntervalResults;
+use super::intervals::Samples;
 use super::measurement::{Figures, TimeBudget};
 use super::memory::Memory;
 use super::target::{Line, Target};
@@ -96,9 +96,9 @@ fn recoveries_and_memory(
     let mut roles = Vec::new();
     while recoveries.is_empty() || (begun.elapsed() < budget.length && recoveries.len() < MAX_REPEATS) {
         training.settle(budget)?;
-        let members = training.members()?;
+        let processes = training.processes()?;
         if recoveries.is_empty() {
-            for (role, index, pid) in &members {
+            for (role, index, pid) in &processes {
                 roles.push(RoleMemory {
                     role: role.clone(),
                     index: *index,
@@ -106,7 +106,7 @@ fn recoveries_and_memory(
                 });
             }
         }
-        let learner = members.iter().find(|(role, ..)| role == Role::Learner.name());
+        let learner = processes.iter().find(|(role, ..)| role == Role::Learner.name());
         let pid = learner.and_then(|(.., pid)| Pid::from_raw(*pid as i32));
         let pid = pid.context("the run has no learner to kill")?;
         let killed = Instant::now();
@@ -139,7 +139,7 @@ impl RunFigures {
 impl Spread {
     /// Panics if there are no times.
     fn of(times: impl Iterator<Item = Duration>) -> Self {
-        let mut results = IntervalResults::default();
+        let mut results = Samples::default();
         times.for_each(|time| results.add(time.as_secs_f64()));
         Self {
             median: results.median(),

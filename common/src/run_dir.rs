@@ -2,6 +2,7 @@
 
 use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
+use std::ops::Deref;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -12,7 +13,7 @@ use shoal_channel::control::RunDirId;
 
 use crate::config::{Config, ConfigError};
 
-/// A run directory that exists.
+/// A run directory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunDir {
     path: PathBuf,
@@ -113,23 +114,48 @@ fn write(path: &Path, head: &str, config: &Config) -> Result<(), RunDirError> {
 /// How long `config.toml` may be missing: some editors rename the old file before they write the new one.
 const EDITING: Duration = Duration::from_millis(300);
 
-/// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.
+/// A run that this process has locked. The launcher keeps it locked while the run is running; the system releases the
+/// lock when the launcher dies.
 #[derive(Debug)]
-pub struct RunLock {
+pub struct LockedRun {
+    run: RunDir,
     directory: File,
 }
 
-impl RunLock {
+impl Deref for LockedRun {
+    type Target = RunDir;
+
+    fn deref(&self) -> &RunDir {
+        &self.run
+    }
+}
+
+impl LockedRun {
+    /// Releases the lock.
+    pub fn unlock(self) -> RunDir {
+        self.run
+    }
+
+    /// Whether another directory, or nothing, is at the path now.
+    fn is_elsewhere(&self) -> bool {
+        let number = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
+        match (self.directory.metadata(), std::fs::metadata(&self.run.path)) {
+            (Ok(locked), Ok(there)) => number(locked) != number(there),
+            (_, Err(error)) => matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory),
+            (Err(_), Ok(_)) => false,
+        }
+    }
+
     /// Checks that the run is still where it was when it was locked.
     ///
     /// # Errors
     /// When its directory was removed or renamed, even if there is another one now, or its `config.toml` was deleted.
-    pub fn check(&self, run: &RunDir) -> Result<(), RunDirError> {
-        let number = |metadata: io::Result<std::fs::Metadata>| metadata.map(|it| (it.dev(), it.ino())).ok();
-        let is_same = || number(self.directory.metadata()) == number(std::fs::metadata(&run.path));
+    pub fn check(&self) -> Result<(), RunDirError> {
+        let run = &self.run;
         let since = Instant::now();
-        while is_same() {
-            if run.config_file().is_file() {
+        while !self.is_elsewhere() {
+            // What cannot be inspected for the moment, as on a busy network file system, is not gone.
+            if !matches!(run.config_file().try_exists(), Ok(false)) {
                 return Ok(());
             }
             if since.elapsed() >= EDITING {
@@ -190,8 +216,8 @@ impl RunDir {
         }
     }
 
-    /// A run directory that does not exist yet. The file system is neither read nor changed.
-    pub fn planned(path: &Path) -> Self {
+    /// The run directory at this path, whether it exists or not. The file system is neither read nor changed.
+    pub fn at(path: &Path) -> Self {
         Self { path: path.into() }
     }
 
@@ -211,11 +237,11 @@ impl RunDir {
         Ok(Self { path })
     }
 
-    /// Claims the run for this process until the lock is dropped.
+    /// Claims the run for this process until the result is dropped.
     ///
     /// # Errors
-    /// When another process holds it.
-    pub fn lock(&self) -> Result<RunLock, RunDirError> {
+    /// When another process has locked it.
+    pub fn lock(&self) -> Result<LockedRun, RunDirError> {
         let io = |cause| RunDirError::Io {
             action: "lock",
             path: self.path.clone(),
@@ -223,10 +249,18 @@ impl RunDir {
         };
         let file = File::open(&self.path).map_err(io)?;
         // A process that only checks whether the run is running holds the lock for a moment.
-        match file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
-            true => Ok(RunLock { directory: file }),
-            false => Err(RunDirError::Busy(self.path.clone())),
+        if !file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
+            return Err(RunDirError::Busy(self.path.clone()));
         }
+        let locked = LockedRun {
+            run: self.clone(),
+            directory: file,
+        };
+        // Its last owner may have removed it meanwhile.
+        if locked.is_elsewhere() {
+            return Err(RunDirError::Gone(self.path.clone()));
+        }
+        Ok(locked)
     }
 
     /// Whether a launcher is running the run.
@@ -243,11 +277,11 @@ impl RunDir {
         file_lock::is_locked(&file).map_err(io)
     }
 
-    /// The key that distinguishes the directory from its copies.
+    /// What distinguishes the directory from its copies.
     ///
     /// # Errors
     /// When the directory cannot be inspected.
-    pub fn key(&self) -> Result<RunDirId, RunDirError> {
+    pub fn directory_id(&self) -> Result<RunDirId, RunDirError> {
         let metadata = std::fs::metadata(&self.path).map_err(|cause| RunDirError::Io {
             action: "inspect",
             path: self.path.clone(),
@@ -402,7 +436,7 @@ impl RunDir {
     }
 
     /// `learner.csv`: losses, rates and ratio over time.
-    pub fn learner_log(&self) -> PathBuf {
+    pub fn learner_records(&self) -> PathBuf {
         self.path.join("learner.csv")
     }
 
@@ -511,16 +545,16 @@ mod tests {
         assert!(matches!(RunDir::create(&nowhere), Err(RunDirError::Io { .. })));
         assert!(!parent.path().join("a").exists(), "what it made is removed");
 
-        let lock = first.lock().unwrap();
+        let locked = first.lock().unwrap();
         assert!(matches!(first.lock(), Err(RunDirError::Busy(_))));
         std::fs::write(first.config_file(), "").unwrap();
-        lock.check(&first).unwrap();
+        locked.check().unwrap();
         std::fs::remove_dir_all(first.path()).unwrap();
-        assert!(matches!(lock.check(&first), Err(RunDirError::Gone(_))));
+        assert!(matches!(locked.check(), Err(RunDirError::Gone(_))));
         let first = RunDir::create(first.path()).unwrap();
         std::fs::write(first.config_file(), "").unwrap();
-        assert!(lock.check(&first).is_err(), "this is another one");
-        drop(lock);
+        assert!(locked.check().is_err(), "this is another one");
+        drop(locked);
         first.lock().unwrap();
     }
 }

@@ -97,13 +97,13 @@ def to_minari(
 
 
 def check_id(dataset_id: str) -> None:
-    """Raises :class:`ShoalError` for what is no name of a dataset with a version."""
+    """Raises :class:`ShoalError` for what is not the name of a dataset with a version."""
     from minari.dataset.minari_dataset import parse_dataset_id
 
     try:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError) as error:
-        raise ShoalError(f"{dataset_id!r} is no name of a dataset: it is like pendulum/expert-v0") from error
+        raise ShoalError(f"{dataset_id!r} is not a dataset's name: write one like pendulum/expert-v0") from error
 
 
 def environment_of(config: Mapping[str, Any]) -> gymnasium.Env[Any, Any] | None:

@@ -2,8 +2,8 @@
 
 The file has the form of the program's other sealed files: the bytes ``SHOALDEM``, the format's number (u32), a body,
 and a CRC-32 of all before. The body is the length of a header (u64), the header as TOML, and the rows as f32: ``s, a,
-r, terminated, s', last``. All numbers are little-endian. The program makes a row's discount of ``terminated`` and its
-γ. ``run/src/demonstrations.rs`` reads it.
+r, terminated, s', last``. All numbers are little-endian. The program computes a row's discount from ``terminated``
+and its own γ. ``run/src/demonstrations.rs`` reads it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The rows of a replay, put together to the episodes that they come from."""
+"""The rows of a replay, grouped into the episodes that they come from."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Episodes:
         places: for each episode the places of its rows in ``batch``, in their order. Episodes are in the order of their
             first rows. One without a row that is ``last`` was cut: it is under way, or its process was replaced.
         begun_with: rows of another run, or of a dataset, that are in the replay too. They are left out.
-        overwritten: rows of this run that the ring has no more. The episodes that they began begin later here.
+        overwritten: rows of this run that the ring no longer has. The episodes that they began begin later here.
     """
 
     batch: Batch
@@ -60,7 +60,7 @@ def episodes(run: Run) -> Episodes:
             f"actors.envs = {envs} and {actors} actors: their episodes cannot be told apart, because {what}; collect "
             "with --actors 1 --envs 1"
         ) from None
-    return Episodes(own, chains(own, before), len(batch) - len(own), max(oldest - begun_with, 0))
+    return Episodes(own, group_by_episode(own, before), len(batch) - len(own), max(oldest - begun_with, 0))
 
 
 def check(config: Mapping[str, Any]) -> None:
@@ -110,7 +110,7 @@ def rows_before(batch: Batch) -> np.ndarray:
     return before
 
 
-def chains(batch: Batch, before: np.ndarray) -> list[np.ndarray]:
+def group_by_episode(batch: Batch, before: np.ndarray) -> list[np.ndarray]:
     """The places of the rows of each episode. A row begins one if the row before it was the last of one, or led
     elsewhere."""
     observations, following = batch.observation.view(np.uint32), batch.next_observation.view(np.uint32)

@@ -94,7 +94,7 @@ class Suite:
         Raises ``TimeoutError`` if one still does.
         """
         give_up = None if timeout is None else time.monotonic() + timeout
-        while is_worked_on(self.path):
+        while is_locked(self.path):
             if give_up is not None and time.monotonic() > give_up:
                 raise TimeoutError(f"{self.path} is still worked on after {timeout} s")
             time.sleep(0.5)
@@ -108,7 +108,7 @@ def _result(run: Path) -> dict[str, Any]:
     return next((policy for policy in policies if policy["policy"] == result["kept"]), {})
 
 
-def is_worked_on(directory: Path) -> bool:
+def is_locked(directory: Path) -> bool:
     """Whether a process holds the lock of this run or suite, as the launcher of a running run does."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:

@@ -1,7 +1,7 @@
 """Copies what a run records to a tracker, Weights & Biases or MLflow, while it runs and afterwards.
 
-``shoal track RUN --to mlflow`` calls this module. It needs the tracker's own Python package. Of the run's files it
-changes none. It adds ``tracking-<tracker>.json``, which says which run of the tracker this is, and how many lines of
+``shoal track RUN --to mlflow`` calls this module. It needs the tracker's own Python package. It changes none of the
+run's files. It adds ``tracking-<tracker>.json``, which says which run of the tracker this is, and how many lines of
 each file were sent. So it may be interrupted and repeated; at most the lines that were being sent are sent twice.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from .errors import ShoalError
 from .run import Run
-from .suite import Suite, is_worked_on
+from .suite import Suite, is_locked
 
 #: The files that are followed, and what their metrics are called.
 FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
@@ -30,13 +30,13 @@ FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "epis
 NOT_METRICS = {"wall_seconds", "env_steps", "actor", "environment", "best", "terminated"}
 
 #: Lines that are sent together.
-TOGETHER = 500
+BATCH_LINES = 500
 
 #: Files of a run that a tracker keeps, beside its figures.
 ARTIFACTS = ("config.toml", "config/used.toml", "changes.csv", "report.html")
 
 #: Seconds between two looks at a run.
-PAUSE = 2.0
+POLL_SECONDS = 2.0
 
 
 class Tracker(Protocol):
@@ -99,8 +99,8 @@ class MLflow:
             for seconds, step, values in rows
             for name, value in values.items()
         ]
-        for first in range(0, len(metrics), TOGETHER):
-            self._client.log_batch(self.id, metrics=metrics[first : first + TOGETHER])
+        for first in range(0, len(metrics), BATCH_LINES):
+            self._client.log_batch(self.id, metrics=metrics[first : first + BATCH_LINES])
 
     def result(self, values: Mapping[str, float]) -> None:
         for name, value in values.items():
@@ -171,13 +171,13 @@ def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", foll
             for run in runs(path):
                 if run.path not in tracked:
                     tracked[run.path] = Copy(run, to, project, group)
-            # What a run wrote before it ended is copied after its end was seen.
-            continues = any(map(is_worked_on, [path, *tracked]))
+            # Looked at before copying, so that a run's last lines are copied too.
+            continues = any(map(is_locked, [path, *tracked]))
             for copy in tracked.values():
                 copy.update()
             if not (follow and continues):
                 break
-            time.sleep(PAUSE)
+            time.sleep(POLL_SECONDS)
     finally:
         with contextlib.ExitStack() as closing:
             # One that fails does not keep the others open.
@@ -227,7 +227,7 @@ class Copy:
         self._tracker.files(self.run, [path for path in files if path.is_file()])
         outcome = self.run.path / "outcome.json"
         finished = outcome.is_file() and json.loads(outcome.read_text(encoding="utf-8"))["state"] == "finished"
-        running = is_worked_on(self.run.path)
+        running = is_locked(self.run.path)
         self._tracker.close("running" if running else "finished" if finished else "stopped")
 
     def _save(self) -> None:

@@ -25,7 +25,7 @@ def batch(*rows):
 
 def grouped(rows, before=None):
     before = episodes.rows_before(rows) if before is None else before
-    return [places.tolist() for places in episodes.chains(rows, before)]
+    return [places.tolist() for places in episodes.group_by_episode(rows, before)]
 
 
 class Rows(unittest.TestCase):

@@ -51,7 +51,7 @@ class Track(unittest.TestCase):
         self.addCleanup(place.cleanup)
         self.place = Path(place.name)
         Recorder.told = {}
-        track.TRACKERS["recorder"], track.PAUSE = Recorder, 0.02
+        track.TRACKERS["recorder"], track.POLL_SECONDS = Recorder, 0.02
         self.addCleanup(track.TRACKERS.pop, "recorder")
 
     def make(self, name: str) -> Path:

@@ -24,11 +24,11 @@ enum Protocol {
     Tls,
 }
 
-/// Why a text is no endpoint.
+/// Why a text is not an endpoint.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EndpointError {
     /// It is not written as one.
-    #[error("{0} is no endpoint: write tls/HOST:PORT, or tcp/127.0.0.1:PORT within one machine")]
+    #[error("{0} is not an endpoint: write tls/HOST:PORT, or tcp/127.0.0.1:PORT within one machine")]
     Form(String),
     /// Data would cross a network unencrypted.
     #[error("{0} is not an address of this machine alone: without encryption, only 127.0.0.1 and [::1] are allowed")]

@@ -58,7 +58,10 @@ const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
 const WARNING_INTERVAL: Duration = Duration::from_secs(10);
 
 /// How long at least to announce that the run is over.
-const END_ANNOUNCEMENT: Duration = Duration::from_secs(1);
+const END_ANNOUNCEMENT: Duration = Duration::from_secs(2);
+
+/// How long hosts may take to find a new gate.
+const CONNECTING: Duration = Duration::from_secs(10);
 
 /// What the gate needs.
 #[derive(Clone, Debug)]
@@ -147,13 +150,14 @@ struct Gate<'a> {
     acknowledgements_sent: u64,
     /// When something wrong was last named.
     warned_at: Option<Instant>,
+    started_at: Instant,
     /// Since when the run is over.
     over_since: Option<Instant>,
     connections_refreshed_at: Instant,
     /// When the launcher last got the status of the hosts.
     reported_to_launcher_at: Option<Instant>,
-    /// The launcher has not answered the last report on the hosts yet.
-    launcher_owes_answer: bool,
+    /// Whether the launcher has yet to answer the last report on the hosts.
+    awaits_launcher: bool,
     sleep: Duration,
 }
 
@@ -185,7 +189,7 @@ impl<'a> Gate<'a> {
         };
         let layout = config.policy_layout()?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        let requests = LauncherRequests::start(&config.run.id, config.actors.max, run.key()?)?;
+        let requests = LauncherRequests::start(&config.run.id, config.actors.max, run.directory_id()?)?;
         let session = network::listen(&settings.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
         declare(&session, &config.run.id, &sender)?;
@@ -209,10 +213,11 @@ impl<'a> Gate<'a> {
             episodes: Reporter::open(domain)?,
             acknowledgements_sent: 0,
             warned_at: None,
+            started_at: Instant::now(),
             over_since: None,
             connections_refreshed_at: Instant::now(),
             reported_to_launcher_at: None,
-            launcher_owes_answer: false,
+            awaits_launcher: false,
             sleep: LONGEST_SLEEP,
         }))
     }
@@ -224,13 +229,13 @@ impl<'a> Gate<'a> {
             let more: Vec<Arrival> = self.arrivals.try_iter().collect();
             let mut forwarded_rows = 0;
             for arrival in first.into_iter().chain(more) {
-                forwarded_rows += self.take(arrival)?;
+                forwarded_rows += self.handle(arrival)?;
             }
             if forwarded_rows > 0 {
                 self.learner_notifier.notify();
                 self.heartbeat.count(forwarded_rows);
             }
-            self.take_answers()?;
+            self.handle_answers()?;
             let progress = self.read_commits();
             self.send_acknowledgements()?;
             self.policies.send(&mut self.hosts)?;
@@ -256,26 +261,28 @@ impl<'a> Gate<'a> {
         // The announcement also reaches a host that reconnects meanwhile.
         let was_announced = since.elapsed() >= END_ANNOUNCEMENT;
         let gone = |host: &Host| host.has_left || (was_announced && host.heard_at.elapsed() >= CUT_OFF_AFTER);
-        // A gate that has just started does not know its hosts before the launcher has answered.
-        let has_told_all = self.epoch.is_some() && self.hosts.values().all(gone);
+        // A gate that has just started does not know its hosts before the launcher has answered. Hosts that the launcher
+        // does not know yet need a moment to connect.
+        let knows_all = self.epoch.is_some() && (was_announced || since >= self.started_at + CONNECTING);
+        let has_told_all = knows_all && self.hosts.values().all(gone);
         has_told_all || since.elapsed() >= HAND_OVER_TIMEOUT
     }
 
     /// Handles what a host has sent. Returns the rows that were forwarded to the learner.
-    fn take(&mut self, arrival: Arrival) -> Result<u64, GateError> {
+    fn handle(&mut self, arrival: Arrival) -> Result<u64, GateError> {
         match arrival {
-            Arrival::Chunk(bytes) => return self.take_chunk(&bytes),
+            Arrival::Chunk(bytes) => return self.handle_chunk(&bytes),
             Arrival::Report(bytes) => match HostReport::decode(&bytes) {
-                Ok(report) => self.take_report(report)?,
+                Ok(report) => self.handle_report(report)?,
                 Err(error) => self.warn(format_args!("a host sent a report that is not read: {error}")),
             },
-            Arrival::Join(query) => self.take_join(query)?,
-            Arrival::Policy(query) => self.take_policy_query(query),
+            Arrival::Join(query) => self.handle_join(query)?,
+            Arrival::Policy(query) => self.handle_policy_query(query),
         }
         Ok(0)
     }
 
-    fn take_chunk(&mut self, bytes: &[u8]) -> Result<u64, GateError> {
+    fn handle_chunk(&mut self, bytes: &[u8]) -> Result<u64, GateError> {
         let chunk = match WireChunk::decode(bytes) {
             Ok(chunk) => chunk,
             Err(error) => {
@@ -303,7 +310,8 @@ impl<'a> Gate<'a> {
             if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
                 host.warned_at = Some(Instant::now());
                 tracing::warn!(
-                    "host {} sent a chunk of actor {} that no actor of this run sends; it is ignored",
+                    "host {} sent an invalid chunk of actor {} (wrong shape, a number that is not finite, or an earlier lease); it is \
+                     ignored",
                     host.lease.name,
                     chunk.header.actor
                 );
@@ -319,7 +327,7 @@ impl<'a> Gate<'a> {
         Ok(chunk.header.rows.into())
     }
 
-    fn take_report(&mut self, report: HostReport) -> Result<(), GateError> {
+    fn handle_report(&mut self, report: HostReport) -> Result<(), GateError> {
         let Some(host) = self.hosts.get_mut(&report.host) else {
             // The empty acknowledgement makes it ask to be admitted.
             return self.acknowledge_nothing(report.host);
@@ -345,7 +353,7 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    fn take_join(&mut self, query: Query) -> Result<(), GateError> {
+    fn handle_join(&mut self, query: Query) -> Result<(), GateError> {
         let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
         let hello = match Hello::decode(&bytes.unwrap_or_default()) {
             Ok(hello) => hello.with_plain_name(),
@@ -353,7 +361,7 @@ impl<'a> Gate<'a> {
         };
         if hello.program != env!("CARGO_PKG_VERSION") {
             let why = format!(
-                "this host has version {} of the program, the learner's host {}",
+                "this host has version {} of the program, the learner's host {}: install the same version on both",
                 hello.program,
                 env!("CARGO_PKG_VERSION")
             );
@@ -364,7 +372,7 @@ impl<'a> Gate<'a> {
         if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
             let why = format!(
                 "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
-                 would not have the same bits"
+                 would not have the same bits; join from a host with the same ones"
             );
             tracing::warn!("host {} is refused: {why}", hello.name);
             return answer_join(&query, &Admission::Refused(why));
@@ -382,7 +390,7 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    fn take_policy_query(&mut self, query: Query) {
+    fn handle_policy_query(&mut self, query: Query) {
         let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
         match PolicyRequest::decode(&bytes.unwrap_or_default()) {
             Ok(request) => {
@@ -402,10 +410,10 @@ impl<'a> Gate<'a> {
         }
     }
 
-    /// Takes what the launcher has answered.
-    fn take_answers(&mut self) -> Result<(), GateError> {
+    /// Handles what the launcher has answered.
+    fn handle_answers(&mut self) -> Result<(), GateError> {
         while let Some((answer, pending)) = self.requests.answer() {
-            self.launcher_owes_answer &= !matches!(pending, PendingRequest::Hosts);
+            self.awaits_launcher &= !matches!(pending, PendingRequest::Hosts);
             match (answer, pending) {
                 (Ok(ControlResponse::Admitted(lease)), PendingRequest::Join(query, hello)) => {
                     tracing::info!(
@@ -488,7 +496,7 @@ impl<'a> Gate<'a> {
         self.open_forwarders()
     }
 
-    /// Opens the ways to the learner that are free.
+    /// Opens a forwarder for each actor for which no other process sends.
     fn open_forwarders(&mut self) -> Result<(), GateError> {
         let config = &self.settings.config;
         let (layout, window) = (config.chunk_layout(), config.actors.window);
@@ -505,7 +513,7 @@ impl<'a> Gate<'a> {
         self.actors.retain(|_, actor| actor.host != host);
     }
 
-    /// Reads what the learner has committed. Returns whether it is news.
+    /// Reads what the learner has committed. Returns whether anything has changed.
     fn read_commits(&mut self) -> bool {
         let mut news = false;
         for (index, actor) in &mut self.actors {
@@ -580,7 +588,7 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// What the next acknowledgement has, whichever host it is for. `None` before the launcher has answered.
+    /// The part of the next acknowledgement that is the same for every host. `None` before the launcher has answered.
     fn acknowledgement_without_actors(&self) -> Option<Acknowledgement> {
         Some(Acknowledgement {
             epoch: self.epoch?,
@@ -613,14 +621,14 @@ impl<'a> Gate<'a> {
 
     /// Sends the launcher the status of the hosts, and asks which are admitted.
     fn report_to_launcher(&mut self) {
-        if self.launcher_owes_answer
+        if self.awaits_launcher
             || self
                 .reported_to_launcher_at
                 .is_some_and(|at| at.elapsed() < STATUS_INTERVAL)
         {
             return;
         }
-        (self.reported_to_launcher_at, self.launcher_owes_answer) = (Some(Instant::now()), true);
+        (self.reported_to_launcher_at, self.awaits_launcher) = (Some(Instant::now()), true);
         let newest = self.policies.version();
         let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
         self.requests
@@ -691,14 +699,14 @@ fn declare(session: &Session, run_id: &str, arrivals: &Sender<Arrival>) -> Resul
         .callback(move |query| drop(sender.send(Arrival::Join(query))))
         .background()
         .wait()
-        .map_err(failed("be asked"))?;
+        .map_err(failed("receive join requests"))?;
     let sender = to(arrivals);
     session
         .declare_queryable(network::policy(run_id))
         .callback(move |query| drop(sender.send(Arrival::Policy(query))))
         .background()
         .wait()
-        .map_err(failed("be asked"))
+        .map_err(failed("receive policy requests"))
 }
 
 /// Only the newest acknowledgement counts, and it is repeated, so one may be dropped where the network is busy.

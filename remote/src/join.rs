@@ -1,5 +1,7 @@
 //! Asking a run to be admitted.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -10,7 +12,7 @@ use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::network::{self, NetworkError, failed};
 use crate::relay::REJOIN_INTERVAL;
-use crate::wire::{Admission, Hello, HostReport, Message, WireError};
+use crate::wire::{Acknowledgement, Admission, Hello, HostReport, Message, RunPhase, WireError};
 
 /// How long the gate may take to answer.
 const ANSWER: Duration = Duration::from_secs(10);
@@ -60,6 +62,7 @@ pub struct GateConnection(Session);
 pub struct LeaseKeeper {
     /// `None` if nobody waits for its end.
     thread: Option<JoinHandle<()>>,
+    run_is_over: Arc<AtomicBool>,
     /// Ends the thread; true if the host leaves.
     end: Sender<bool>,
 }
@@ -71,8 +74,22 @@ impl LeaseKeeper {
     /// When there can be no thread.
     pub fn start(connection: GateConnection, run_id: String, host: u64) -> Result<Self, std::io::Error> {
         let (end, ended) = channel();
+        let run_is_over = Arc::new(AtomicBool::new(false));
+        let is_over = Arc::clone(&run_is_over);
+        let has_heard = Arc::clone(&run_is_over);
         let keep = move || {
             let key = network::reports(&run_id, &host.to_string());
+            let hear = move |acknowledgement: &[u8]| {
+                if Acknowledgement::decode(acknowledgement).is_ok_and(|news| news.phase == RunPhase::Over) {
+                    has_heard.store(true, Ordering::Relaxed);
+                }
+            };
+            // Without it, only the relay hears of the run's end.
+            let _subscriber = connection
+                .0
+                .declare_subscriber(network::acknowledgements(&run_id, host))
+                .callback(move |sample| hear(&sample.payload().to_bytes()))
+                .wait();
             let send = |number, leaving| {
                 let report = HostReport::without_processes(host, number, leaving);
                 if let Ok(bytes) = report.encode() {
@@ -84,6 +101,8 @@ impl LeaseKeeper {
             for number in 1.. {
                 send(number, false);
                 match ended.recv_timeout(REPORT_INTERVAL) {
+                    // So that the gate need not wait for this host.
+                    Err(RecvTimeoutError::Timeout) if is_over.load(Ordering::Relaxed) => send(number + 1, true),
                     Err(RecvTimeoutError::Timeout) => {}
                     Ok(false) | Err(RecvTimeoutError::Disconnected) => break,
                     Ok(true) => {
@@ -96,7 +115,16 @@ impl LeaseKeeper {
         };
         let thread = std::thread::Builder::new().name("lease".into()).spawn(keep)?;
         let thread = Some(thread);
-        Ok(Self { thread, end })
+        Ok(Self {
+            thread,
+            run_is_over,
+            end,
+        })
+    }
+
+    /// Whether the run has ended since the host was admitted.
+    pub fn run_is_over(&self) -> bool {
+        self.run_is_over.load(Ordering::Relaxed)
     }
 
     /// Ends the reports, because the relay sends them from now on. The connection may take a while to close.

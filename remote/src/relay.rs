@@ -94,9 +94,14 @@ pub enum RelayError {
     /// The copy of the commit record cannot be written.
     #[error("cannot write the copy of the commit record: {0}")]
     Mirror(std::io::Error),
-    /// The system refused.
-    #[error("the system refuses: {0}")]
-    System(#[from] std::io::Error),
+    /// The system refused something that the relay needs.
+    #[error("cannot {action}: {cause}")]
+    System {
+        /// What, such as "start a thread".
+        action: &'static str,
+        /// The system's reason.
+        cause: std::io::Error,
+    },
 }
 
 /// Something that has come from the gate.
@@ -209,7 +214,7 @@ impl<'a> Relay<'a> {
         }
         let session = network::connect(&host.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
-        let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?;
+        let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(refused("create an event"))?;
         let wake = Wake {
             arrivals: sender,
             event: Arc::new(event),
@@ -232,7 +237,8 @@ impl<'a> Relay<'a> {
         let now = Instant::now();
         Ok(Self {
             chunk_queue: start_sending(&session, host)?,
-            requests: LauncherRequests::start(&config.run.id, config.actors.max, run.key()?)?,
+            requests: LauncherRequests::start(&config.run.id, config.actors.max, run.directory_id()?)
+                .map_err(refused("start a thread"))?,
             heartbeat_reports: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
             settings,
@@ -271,9 +277,9 @@ impl<'a> Relay<'a> {
         loop {
             let arrivals: Vec<Arrival> = self.arrivals.try_iter().collect();
             for arrival in arrivals {
-                self.take(arrival)?;
+                self.handle(arrival)?;
             }
-            self.take_chunks()?;
+            self.handle_chunks()?;
             self.send_chunks();
             self.read_reports()?;
             if self.last_report.1.elapsed() >= REPORT_INTERVAL {
@@ -306,10 +312,10 @@ impl<'a> Relay<'a> {
         self.started_at.elapsed()
     }
 
-    fn take(&mut self, arrival: Arrival) -> Result<(), RelayError> {
+    fn handle(&mut self, arrival: Arrival) -> Result<(), RelayError> {
         match arrival {
             Arrival::Acknowledgement(bytes) => match Acknowledgement::decode(&bytes) {
-                Ok(acknowledgement) => self.take_acknowledgement(&acknowledgement),
+                Ok(acknowledgement) => self.handle_acknowledgement(&acknowledgement),
                 Err(error) => {
                     tracing::warn!("the gate sent an acknowledgement that is not read: {error}");
                     Ok(())
@@ -322,11 +328,11 @@ impl<'a> Relay<'a> {
                     Ok(())
                 }
             },
-            Arrival::Admission(answer) => self.take_admission(answer),
+            Arrival::Admission(answer) => self.handle_admission(answer),
         }
     }
 
-    fn take_acknowledgement(&mut self, acknowledgement: &Acknowledgement) -> Result<(), RelayError> {
+    fn handle_acknowledgement(&mut self, acknowledgement: &Acknowledgement) -> Result<(), RelayError> {
         if (acknowledgement.gate, acknowledgement.number) <= self.last_acknowledgement {
             return Ok(());
         }
@@ -436,7 +442,7 @@ impl<'a> Relay<'a> {
         }
     }
 
-    fn take_admission(&mut self, answer: Result<Admission, String>) -> Result<(), RelayError> {
+    fn handle_admission(&mut self, answer: Result<Admission, String>) -> Result<(), RelayError> {
         self.rejoin_request = Some((Instant::now(), false));
         let host = &self.settings.host;
         match answer {
@@ -472,8 +478,8 @@ impl<'a> Relay<'a> {
         Ok(())
     }
 
-    /// Takes the chunks of the actors.
-    fn take_chunks(&mut self) -> Result<(), RelayError> {
+    /// Handles the chunks of the actors.
+    fn handle_chunks(&mut self) -> Result<(), RelayError> {
         // Before the first acknowledgement nobody knows what is committed.
         if self.heard_at.is_none() {
             return Ok(());
@@ -590,7 +596,7 @@ impl<'a> Relay<'a> {
         ];
         match poll(&mut ready, patience.as_ref()) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
-            Err(errno) => return Err(std::io::Error::from(errno).into()),
+            Err(errno) => return Err(refused("wait for chunks")(errno)),
         }
         let mut count = [0; 8];
         // It fails if there was no arrival.
@@ -600,7 +606,15 @@ impl<'a> Relay<'a> {
     }
 }
 
-/// Has an actor started again whose chunks the replay has lost.
+/// For `map_err`.
+fn refused<E: Into<std::io::Error>>(action: &'static str) -> impl Fn(E) -> RelayError {
+    move |cause| RelayError::System {
+        action,
+        cause: cause.into(),
+    }
+}
+
+/// Restarts an actor whose chunks the replay has lost.
 fn start_again(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
     if let ActorFollowUp::StartAgain(incarnation) = follow_up {
         tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
@@ -617,13 +631,16 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
         .wait()
         .map_err(failed("send chunks"))?;
     let (sender, chunks) = sync_channel::<ZBytes>(CHUNK_QUEUE_LENGTH);
-    std::thread::Builder::new().name("sender".into()).spawn(move || {
-        for chunk in chunks {
-            if let Err(cause) = publisher.put(chunk).wait() {
-                tracing::debug!("a chunk was not sent: {cause}");
+    std::thread::Builder::new()
+        .name("sender".into())
+        .spawn(move || {
+            for chunk in chunks {
+                if let Err(cause) = publisher.put(chunk).wait() {
+                    tracing::debug!("a chunk was not sent: {cause}");
+                }
             }
-        }
-    })?;
+        })
+        .map_err(refused("start a thread"))?;
     Ok(sender)
 }
 
@@ -675,6 +692,9 @@ fn start_asking_for_policies(
             }
         }
     };
-    std::thread::Builder::new().name("policies".into()).spawn(ask)?;
+    std::thread::Builder::new()
+        .name("policies".into())
+        .spawn(ask)
+        .map_err(refused("start a thread"))?;
     Ok(())
 }

@@ -17,7 +17,7 @@ use shoal_env_server::frame::{Frame, Image};
 use shoal_run::description;
 use shoal_run::evaluation::frames::Frames;
 use shoal_run::evaluation::rollout::Rollout;
-use shoal_run::signals::Interrupt;
+use shoal_run::signals::{self, Interrupt};
 
 use self::animation::Animation;
 use self::ffmpeg::Ffmpeg;
@@ -268,7 +268,7 @@ impl<'a, W: Write> Writer<'a, W> {
 
 fn check(interrupt: &Interrupt) -> anyhow::Result<()> {
     match interrupt.signal() {
-        Some(signal) => bail!("ended by signal {signal}"),
+        Some(signal) => bail!("ended by {}", signals::describe(signal)),
         None => Ok(()),
     }
 }

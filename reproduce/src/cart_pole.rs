@@ -18,6 +18,9 @@ const SPAN: usize = 100;
 /// The task is solved when the moving average reaches this return.
 const SOLVED: f64 = 195.0;
 
+/// After a drop, a moving average above this return ends it.
+const RECOVERED: f64 = 190.0;
+
 /// After the task was solved, a moving average below this return is a drop in performance.
 const DROPPED: f64 = 150.0;
 
@@ -63,12 +66,12 @@ const fn experiment(name: &'static str, settings: &'static [&'static str]) -> Ex
 
 /// The history of the training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Tests {
+pub(super) struct TrainingHistory {
     /// (episode, mean return of the last [`SPAN`] episodes), every [`CURVE_INTERVAL`] episodes.
     average: Vec<(u64, f64)>,
     /// The first episode at which the average over [`SPAN`] episodes was at least [`SOLVED`].
     solved: Option<u64>,
-    /// How often the average fell below [`DROPPED`] after that. Between two drops it must have been above 190.
+    /// How often the average fell below [`DROPPED`] after that. Between two drops it must have been above [`RECOVERED`].
     drops: u32,
     /// The share of the episodes from `solved` on at which the average was below [`DROPPED`].
     below: Option<f64>,
@@ -76,7 +79,7 @@ pub(super) struct Tests {
     dead: bool,
 }
 
-impl Tests {
+impl TrainingHistory {
     fn of(returns: &[f64], dead: bool) -> Self {
         let averages: Vec<f64> = (1..=returns.len())
             .map(|end| {
@@ -94,7 +97,7 @@ impl Tests {
         for average in after {
             if high && *average < DROPPED {
                 (drops, high) = (drops + 1, false);
-            } else if *average > 190.0 {
+            } else if *average > RECOVERED {
                 high = true;
             }
         }
@@ -138,16 +141,16 @@ impl Tests {
 pub(super) struct CartPole;
 
 impl Family for CartPole {
-    type Tests = Tests;
+    type Tests = TrainingHistory;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<TrainingHistory> {
         let episodes = policies.episodes()?;
         let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
-        Ok(Tests::of(&returns, is_dead(policies)?))
+        Ok(TrainingHistory::of(&returns, is_dead(policies)?))
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<TrainingHistory>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let variants = VARIANTS.map(|(name, label)| (label, results.of(name, "")));
         let settings: Vec<CurvesOfSetting> = variants
             .iter()
@@ -226,7 +229,7 @@ fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     Ok(first.is_none_or(|first| each.all(|scores| scores == first)))
 }
 
-type Seeds<'a> = &'a [SeedResult<Tests>];
+type Seeds<'a> = &'a [SeedResult<TrainingHistory>];
 
 fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim> {
     let solved = |seeds: Seeds<'_>| seeds.iter().filter_map(|seed| seed.tests.solved).count();
@@ -342,8 +345,8 @@ mod tests {
     use super::super::result::tests::result;
     use super::*;
 
-    fn seed(number: u64, returns: &[f64]) -> SeedResult<Tests> {
-        result(&EXPERIMENTS[0], number, 100.0, Tests::of(returns, false))
+    fn seed(number: u64, returns: &[f64]) -> SeedResult<TrainingHistory> {
+        result(&EXPERIMENTS[0], number, 100.0, TrainingHistory::of(returns, false))
     }
 
     /// Returns of consecutive episodes: for each (count, value), `count` times `value`.
@@ -361,16 +364,16 @@ mod tests {
             (150, 0.0),
             (450, 200.0),
         ]);
-        let tests = Tests::of(&returns, false);
+        let tests = TrainingHistory::of(&returns, false);
         // The first mean of at least 195 has 98 episodes of 200 and 2 of 20.
         assert_eq!(tests.solved, Some(598));
         assert_eq!(tests.drops, 2);
         assert!((0.2..0.5).contains(&tests.below.unwrap()), "{:?}", tests.below);
         assert_eq!((tests.average.len(), tests.average[0]), (200, (10, 20.0)));
-        let never = Tests::of(&history(&[(600, 30.0)]), true);
+        let never = TrainingHistory::of(&history(&[(600, 30.0)]), true);
         assert_eq!((never.solved, never.below, never.drops), (None, None, 0));
         assert_eq!(
-            Tests::of(&history(&[(50, 200.0)]), false).solved,
+            TrainingHistory::of(&history(&[(50, 200.0)]), false).solved,
             None,
             "fewer than 100 episodes do not count"
         );

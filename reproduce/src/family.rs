@@ -25,7 +25,7 @@ pub(super) trait Family {
     const EXPERIMENTS: &'static [Experiment];
 
     /// Measures a run that has just reached the end of `stage`.
-    fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
+    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
 
     /// Checks the thesis's claims and draws its figures, from stored results alone.
     fn sections(results: &Results<Self::Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
@@ -138,7 +138,7 @@ fn store_result<F: Family>(
         evaluations,
         best: evaluate(&policies.best)?,
         last: evaluate(&policies.last)?,
-        tests: F::test(&policies, stage)?,
+        tests: F::measure(&policies, stage)?,
     };
     folder.add(experiment, stage, &result)
 }

@@ -143,7 +143,7 @@ impl Family for FrozenLake {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
         let Policies { config, run, last, .. } = policies;
         let layout = policy_layout(config)?;
         let mut steps = 0;

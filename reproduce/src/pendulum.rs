@@ -52,7 +52,7 @@ impl Family for Pendulum {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
         let run = |parameters| SwingUp::run(&mut Rollout::new(&policies.config, parameters)?);
         let best = run(&policies.best.parameters)?;
         Ok(Tests {

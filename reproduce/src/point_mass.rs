@@ -82,7 +82,7 @@ impl Family for PointMass {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let run = |parameters| TestRun::from_starts(&mut Rollout::new(&policies.config, parameters)?, &starts);
         let best = run(&policies.best.parameters)?;

@@ -40,7 +40,7 @@ struct Due {
 
 impl Due {
     fn done(&self, run: &Path) -> Option<u64> {
-        let (steps, episodes) = recorded(&RunDir::planned(run)).ok()??;
+        let (steps, episodes) = recorded(&RunDir::at(run)).ok()??;
         Some(self.length.progress(experiment::Progress { steps, episodes }).0)
     }
 

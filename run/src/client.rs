@@ -19,7 +19,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const SCALE_PATIENCE: Duration = Duration::from_secs(60);
 
 /// How long a run may take to end. Its roles are given less.
-const STOP_PATIENCE: Duration = Duration::from_secs(60);
+const STOP_PATIENCE: Duration = Duration::from_secs(120);
 
 /// How long the launcher of a stopped run may take to draw its figures.
 const FIGURES_PATIENCE: Duration = Duration::from_secs(60);
@@ -63,7 +63,7 @@ impl RunClient {
         let _sweeper = Sweeper::start(domain)?;
         let lives = || self.run.is_running().unwrap_or(true);
         let is_about_status = request == ControlRequest::Status;
-        match control::ask(domain, self.run.key()?, request, patience, lives) {
+        match control::ask(domain, self.run.directory_id()?, request, patience, lives) {
             Ok(ControlResponse::AnotherRun(there)) => {
                 let here = self.run.path().display();
                 bail!("{here} is a copy of {there}, which is running; the launcher in {here} waits for it to end")

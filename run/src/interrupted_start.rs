@@ -21,7 +21,7 @@ pub fn remove_interrupted_start(path: &Path) -> anyhow::Result<bool> {
     if !path.exists() {
         return Ok(true);
     }
-    let run = RunDir::planned(path);
+    let run = RunDir::at(path);
     // Whoever holds the lock is starting the run, or works on it.
     let Ok(_lock) = run.lock() else { return Ok(false) };
     let is_interrupted = is_interrupted(&run)?;
@@ -38,7 +38,7 @@ fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
     }
     if run.config_file().exists() {
         // `origin.json` is written after the networks and rows that the run begins with.
-        return Ok(run.config()?.run.begins_with_others() && Origin::read(run)?.is_none());
+        return Ok(run.config()?.run.has_origin() && Origin::read(run)?.is_none());
     }
     let entries = std::fs::read_dir(run.path()).with_context(|| format!("cannot read {}", run.path().display()))?;
     for entry in entries {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use shoal_common::config::Config;
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir};
 
 use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::{ServerLocation, ServerSurroundings};
@@ -22,12 +22,11 @@ pub fn make_host_directory(
     configuration: &str,
     first_incarnation: u64,
     interrupt: Interrupt,
-) -> anyhow::Result<(Config, RunDir, RunLock)> {
-    let run = RunDir::create(path)?;
-    let lock = run.lock()?;
+) -> anyhow::Result<(Config, LockedRun)> {
+    let run = RunDir::create(path)?.lock()?;
     let made = fill(&run, configuration, first_incarnation, interrupt);
     match made {
-        Ok(config) => Ok((config, run, lock)),
+        Ok(config) => Ok((config, run)),
         Err(error) => {
             let _ = std::fs::remove_dir_all(run.path());
             Err(error)

@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{Config, explanation};
-use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir, RunDirError};
 use shoal_common::section::Change;
 use shoal_common::versioned_file::VersionedFile;
 use shoal_learner::algorithms::algorithm::SavedState;
@@ -118,7 +118,7 @@ impl Beginning {
         };
         let Some(rows) = rows else { return Ok(()) };
         config.run.steps = config.run.steps.saturating_add(rows);
-        // Updates begin with the run's own steps. Those for another run's rows were made by it.
+        // Updates begin with the run's own steps. The other run has already made the updates for its rows.
         (config.replay.ratio_since, config.replay.updates_before) = (rows, 0);
         Ok(config.check()?)
     }
@@ -137,7 +137,7 @@ impl Beginning {
         Ok(origin)
     }
 
-    /// What is worth a warning before a run of this configuration takes the rows along.
+    /// A warning, if one is needed, about the rows that a run of this configuration begins with.
     pub(crate) fn warning(&self, config: &Config) -> Option<String> {
         match self {
             Self::Run(predecessor) => predecessor.warning(config),
@@ -153,7 +153,7 @@ pub(crate) struct Predecessor {
     config: Config,
     checkpoint: Checkpoint,
     /// Its replay, with the lock that keeps its own learner away.
-    replay: Option<(Replay, RunLock)>,
+    replay: Option<(Replay, LockedRun)>,
 }
 
 impl Predecessor {

@@ -15,7 +15,7 @@ mod table;
 use std::path::Path;
 
 use shoal_common::config::Config;
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_common::versioned_file::VersionedFile;
 use shoal_env_server::description::Description;
 
@@ -34,7 +34,7 @@ use crate::origin::{Beginning, Origin, Predecessor};
 use crate::preflight;
 use crate::records::start::StartRecord;
 
-/// What is worth a warning before a run of this configuration starts or goes on.
+/// A warning, if one is needed, before a run of this configuration starts or continues.
 pub fn warning(config: &Config) -> Option<String> {
     let (steps, warmup) = (config.run.steps, config.replay.warmup);
     (steps <= warmup && config.replay.updates_per_step > 0.0).then(|| {
@@ -50,10 +50,8 @@ pub fn warning(config: &Config) -> Option<String> {
 pub struct Plan {
     /// Its resolved configuration.
     pub config: Config,
-    /// Its directory.
-    pub run: RunDir,
-    /// Held for as long as this process owns the run.
-    pub lock: RunLock,
+    /// Its directory. This process owns the run until this is dropped.
+    pub run: LockedRun,
     /// The run or dataset that it begins with, if any.
     pub origin: Option<Origin>,
     /// What is worth a warning before it starts.
@@ -85,19 +83,19 @@ impl Plan {
             beginning.prepare(&mut config)?;
         }
         let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
-        preflight::check(&config, &RunDir::planned(&place))?;
+        preflight::check(&config, &RunDir::at(&place))?;
         let run = match &overrides.run {
             Some(path) => RunDir::create(path)?,
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
         let begin = || {
-            let lock = run.lock()?;
+            let locked = run.lock()?;
             let config = fill(&run, &config, description.as_ref())?;
             StartRecord::of_this_process().write(run.path())?;
             let origin = beginning.as_ref().map(|beginning| beginning.begin(&run, &config));
-            Ok((lock, config, origin.transpose()?))
+            Ok((locked, config, origin.transpose()?))
         };
-        let (lock, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
+        let (locked, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
             let _ = run.remove();
         })?;
@@ -105,8 +103,7 @@ impl Plan {
         Ok(Self {
             warnings: warning(&config).into_iter().chain(of_rows).collect(),
             config,
-            run,
-            lock,
+            run: locked,
             origin,
         })
     }

@@ -201,7 +201,7 @@ impl Suite {
                 });
             }
         }
-        // Values that differ only in what a name cannot have.
+        // If values differ only in characters that a file name cannot have, the runs are numbered.
         let names: BTreeSet<&String> = trials.iter().map(|trial| &trial.name).collect();
         if names.len() < trials.len() {
             let width = trials.len().to_string().len();
@@ -231,7 +231,7 @@ impl Suite {
         let suite = Self::load(&path)?;
         let is_plain = |name: &str| !name.is_empty() && !name.contains('/') && name != "." && name != "..";
         if let Some(trial) = suite.trials.iter().find(|trial| !is_plain(&trial.name)) {
-            bail!("{here} is damaged: {:?} is no name of a run", trial.name);
+            bail!("{here} is damaged: {:?} is not a valid name for a run", trial.name);
         }
         Ok(Some(suite))
     }
@@ -242,7 +242,7 @@ impl Suite {
     /// # Errors
     /// When its file is missing or cannot be read.
     pub fn open(directory: &Path) -> anyhow::Result<Self> {
-        Self::read(directory)?.with_context(|| format!("{} is no suite any more", directory.display()))
+        Self::read(directory)?.with_context(|| format!("{} is no longer a suite", directory.display()))
     }
 
     /// Adds changes of all runs, each as `SECTION.KEY=VALUE`. A later value of a key replaces an earlier one.
@@ -293,7 +293,7 @@ impl Suite {
         ended.into_iter().any(|name| *name == trial.name)
     }
 
-    /// The next round whose end is to be decided; `None` without halving, and after the last round.
+    /// The first round that has not ended; `None` without halving, and after the last round.
     pub fn next_round(&self) -> Option<Round> {
         let completed = self.halving.as_ref()?.ended.len() as u32;
         let rounds = self.settings().len().next_power_of_two().ilog2();
@@ -455,7 +455,7 @@ mod tests {
             Suite::read(parent.path())
                 .unwrap_err()
                 .to_string()
-                .contains("no name of a run")
+                .contains("not a valid name for a run")
         );
 
         let mut changed = suite.clone();

@@ -23,8 +23,28 @@ struct Entry {
     default: Option<Value>,
 }
 
-/// Every key of a configuration, by section. The parameters of an environment are listed under its name.
-fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
+/// The keys of a section, or the parameters of an environment.
+struct Group {
+    section: &'static str,
+    /// The environment whose parameters these are.
+    environment: Option<&'static str>,
+    entries: Vec<Entry>,
+}
+
+impl Group {
+    fn title(&self) -> String {
+        let environment = self.environment.map_or(String::new(), |name| format!(" of {name}"));
+        format!("[{}]{environment}", self.section)
+    }
+
+    /// Whether a run in this environment may have these keys.
+    fn is_for(&self, environment: &str) -> bool {
+        self.environment.is_none_or(|own| own == environment)
+    }
+}
+
+/// Every key of a configuration.
+fn groups() -> anyhow::Result<Vec<Group>> {
     let mut all = Vec::new();
     for section in sections() {
         let entry = |key: Key| Entry {
@@ -32,10 +52,11 @@ fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
             default: section.defaults.get(&key.name).cloned(),
             key,
         };
-        all.push((
-            format!("[{}]", section.name),
-            section.keys.into_iter().map(entry).collect(),
-        ));
+        all.push(Group {
+            section: section.name,
+            environment: None,
+            entries: section.keys.into_iter().map(entry).collect(),
+        });
         if section.name == "environment" {
             for name in environment::names() {
                 let defaults = environment::resolve(name, &Table::new())?;
@@ -45,10 +66,11 @@ fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
                     key,
                 };
                 let keys = environment::explain(name)?;
-                all.push((
-                    format!("[environment] of {name}"),
-                    keys.into_iter().map(entry).collect(),
-                ));
+                all.push(Group {
+                    section: "environment",
+                    environment: Some(name),
+                    entries: keys.into_iter().map(entry).collect(),
+                });
             }
         }
     }
@@ -66,12 +88,11 @@ fn explain_all() -> anyhow::Result<String> {
         .map(preset)
         .collect::<anyhow::Result<Vec<(&str, Table)>>>()?;
     let mut text = HEAD.to_owned();
-    for (title, entries) in entries()? {
-        let _ = writeln!(text, "\n{title}");
-        for entry in entries {
+    for group in groups()? {
+        let _ = writeln!(text, "\n{}", group.title());
+        for entry in &group.entries {
             write_key(&mut text, &entry.key, entry.default.as_ref(), None);
-            let of_environment = title.strip_prefix("[environment] of ");
-            for (value, names) in differing(&presets, &entry, of_environment) {
+            for (value, names) in differing(&presets, entry, group.environment) {
                 let _ = writeln!(text, "      {value} in {}", names.join(", "));
             }
         }
@@ -123,9 +144,9 @@ fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
         "{HEAD}After the brackets: where the value comes from.\n\n{what} is a configuration for {}.\n",
         config.algorithm.name()
     );
-    let environment = format!("[environment] of {}", config.environment.name);
-    for (title, entries) in entries()? {
-        let chosen = entries.iter().filter_map(|entry| {
+    let of_run = |group: &Group| group.is_for(&config.environment.name);
+    for group in groups()?.into_iter().filter(of_run) {
+        let chosen = group.entries.iter().filter_map(|entry| {
             let value = table.get(&entry.section)?.as_table()?.get(&entry.key.name)?;
             // A key that the program sets has no value to show.
             let shown = (!is_filled_in(&entry.key)).then_some(value);
@@ -133,10 +154,10 @@ fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
             Some((&entry.key, shown, shown.map(|_| source)))
         });
         let chosen: Vec<_> = chosen.collect();
-        if chosen.is_empty() || (title.contains(" of ") && title != environment) {
+        if chosen.is_empty() {
             continue;
         }
-        let _ = writeln!(text, "\n{title}");
+        let _ = writeln!(text, "\n{}", group.title());
         for (key, value, source) in chosen {
             write_key(&mut text, key, value, source.as_ref());
         }
@@ -185,20 +206,17 @@ mod tests {
     /// Fails for a new key without an explanation.
     #[test]
     fn every_key_of_every_preset_is_explained() {
-        let entries = entries().unwrap();
+        let groups = groups().unwrap();
         for preset in preset_names() {
             let config = resolve_preset(preset).unwrap();
-            let environment = format!("[environment] of {}", config.environment.name);
+            let of_run = |group: &&Group| group.is_for(&config.environment.name);
             for (section, keys) in table(&config).unwrap() {
                 // The environment's description is not set by the user.
                 if section == "spec" {
                     continue;
                 }
                 for name in keys.as_table().unwrap().keys() {
-                    let explained = entries.iter().flat_map(|(title, entries)| {
-                        let here = !title.contains(" of ") || *title == environment;
-                        entries.iter().filter(move |_| here)
-                    });
+                    let explained = groups.iter().filter(of_run).flat_map(|group| &group.entries);
                     let key = explained
                         .filter(|entry| entry.section == section && entry.key.name == *name)
                         .map(|entry| &entry.key)
@@ -214,9 +232,10 @@ mod tests {
 
     #[test]
     fn every_explanation_has_a_meaning_a_unit_and_a_source() {
-        for (title, entries) in entries().unwrap() {
-            assert!(!entries.is_empty(), "{title}");
-            for Entry { key, .. } in entries {
+        for group in groups().unwrap() {
+            let title = group.title();
+            assert!(!group.entries.is_empty(), "{title}");
+            for Entry { key, .. } in group.entries {
                 assert!(key.meaning.ends_with('.'), "{title} {}: {}", key.name, key.meaning);
                 assert!(!key.unit.is_empty() && !key.source.is_empty(), "{title} {}", key.name);
             }

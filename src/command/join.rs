@@ -98,6 +98,7 @@ mod with_network {
     use std::path::Path;
 
     use anyhow::{Context, bail};
+    use shoal_common::channel::control::RUN_IS_ENDING;
     use shoal_common::message::say;
     use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
@@ -117,7 +118,7 @@ mod with_network {
     const GAVE_UP: u8 = 4;
 
     /// How the names of temporary directories begin; the host's number follows.
-    const TEMPORARY: &str = "shoal-join-";
+    const TEMPORARY_PREFIX: &str = "shoal-join-";
 
     /// This host, as the run knows it, and how it reaches the run.
     struct JoiningHost {
@@ -134,25 +135,25 @@ mod with_network {
         let (endpoint, key) = endpoint(args, run)?;
         remove_abandoned(&std::env::temp_dir());
         let signals = Signals::register()?;
-        let mut time = 1;
+        let mut attempt = 1;
         loop {
-            let ended = join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, time)?;
+            let ended = join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, attempt)?;
             if let Some(code) = ended {
                 return Ok(code);
             }
             say("the run has given the actors of this host to others; joining again");
-            time += 1;
+            attempt += 1;
         }
     }
 
-    /// Joins the run for the `time`-th time; `None` if the host has lost its actors.
+    /// Joins the run; `attempt` counts from 1. `None` if the host has lost its actors.
     fn join_once(
         args: &JoinArgs,
         run: &str,
         actors: u32,
         (endpoint, key): (Endpoint, Option<KeyFile>),
         signals: &Signals,
-        time: u32,
+        attempt: u32,
     ) -> anyhow::Result<Option<ExitCode>> {
         let interrupt = signals.interrupt();
         let number = host_number()?;
@@ -169,19 +170,24 @@ mod with_network {
             held: Vec::new(),
         };
         let ends = || interrupt.signal().is_some() || is_finished(run);
-        // Of a host that joins again, the run may still have what this host is giving back.
+        // When a host joins again, the run may not have got its former actors back yet.
         let said = Cell::new(false);
         let ask_again = |why: &str| {
-            if time > 1 && !said.replace(true) {
+            let again = attempt > 1 && why != RUN_IS_ENDING;
+            if again && !said.replace(true) {
                 say(format!("{endpoint} does not admit this host yet: {why}"));
             }
-            time > 1
+            again
         };
         let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends, ask_again);
         let (lease, connection) = match (admission, interrupt.signal()) {
             (Ok((Admission::Admitted(lease), connection)), _) => (lease, connection),
             (_, Some(signal)) => return Ok(Some(exit_code(signal))),
-            (Ok((Admission::Refused(why), _)), None) if time > 1 => {
+            (Ok((Admission::Refused(why), _)), None) if attempt > 1 && (why == RUN_IS_ENDING || is_finished(run)) => {
+                say("the run is over");
+                return Ok(Some(ExitCode::SUCCESS));
+            }
+            (Ok((Admission::Refused(why), _)), None) if attempt > 1 => {
                 say(format!("error: {endpoint} does not admit this host again: {why}"));
                 return Ok(Some(GAVE_UP.into()));
             }
@@ -196,11 +202,11 @@ mod with_network {
             }
             (Err(error), None) => return Err(error.into()),
         };
-        let temporary = std::env::temp_dir().join(format!("{TEMPORARY}{number:016x}"));
-        let path = match (&args.local, time) {
+        let temporary = std::env::temp_dir().join(format!("{TEMPORARY_PREFIX}{number:016x}"));
+        let path = match (&args.local, attempt) {
             (None, _) => temporary,
             (Some(local), 1) => local.clone(),
-            (Some(local), _) => unused_name(local, time),
+            (Some(local), _) => unused_name(local, attempt),
         };
         let path = path.as_path();
         let host = JoiningHost {
@@ -211,19 +217,18 @@ mod with_network {
         };
         let worked = work(args, host, (lease, connection), path, signals);
         if args.local.is_none() {
-            let log = RunDir::planned(path).log();
+            let log = RunDir::at(path).log();
             if worked.is_err() && log.exists() {
                 say(format!("the log of this host is {}", log.display()));
             } else {
-                let _ = std::fs::remove_dir_all(path);
+                let _ = RunDir::at(path).remove();
             }
         }
         worked
     }
 
-    /// The first of `local` with `-time`, `-time+1`, … at its end that does not exist. Another `join` may have left some.
-    fn unused_name(local: &Path, time: u32) -> PathBuf {
-        let mut number = time;
+    /// The first of `local-NUMBER`, `local-NUMBER+1`, … that does not exist. An earlier `join` may have left some.
+    fn unused_name(local: &Path, mut number: u32) -> PathBuf {
         loop {
             let path = PathBuf::from(format!("{}-{number}", local.display()));
             if !path.exists() {
@@ -248,22 +253,26 @@ mod with_network {
         } = host;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
-        // The environment may take minutes to start, and it may not be usable here. Whatever fails before the relay
-        // runs drops this, and the run has its actors back.
+        // The environment may take minutes to start, and it may not be usable here. If anything fails before the
+        // relay runs, `keeper` is dropped, and that gives the actors back to the run.
         let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
         let interrupt = signals.interrupt();
         if let Some(signal) = interrupt.signal() {
             return Ok(Some(exit_code(signal)));
         }
-        let (config, run, lock) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
+        let (config, run) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
         if let Some(key) = key {
             key.write(&run.path().join(KeyFile::JOIN))?;
         }
         HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&run)?;
+        if keeper.run_is_over() {
+            say("the run is over");
+            return Ok(Some(ExitCode::SUCCESS));
+        }
         let actors = lease.actors.clone();
         say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
-        let relay_runs = Box::new(|| keeper.end());
-        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up, relay_runs);
+        let on_relay_ready = Box::new(|| keeper.end());
+        let ending = joined::run(config, &run, signals, actors, args.give_up, on_relay_ready);
         if args.local.is_none() && ending.is_err() {
             // While this process has the lock, so that no other one takes the directory for an abandoned one.
             keep_log(&run);
@@ -295,9 +304,9 @@ mod with_network {
             let name = entry.file_name();
             let has_name = name
                 .to_str()
-                .and_then(|name| name.strip_prefix(TEMPORARY))
+                .and_then(|name| name.strip_prefix(TEMPORARY_PREFIX))
                 .is_some_and(is_number);
-            // Of a symbolic link, this is the metadata of the link.
+            // For a symbolic link, this describes the link itself.
             let is_ours = |metadata: std::fs::Metadata| metadata.is_dir() && metadata.uid() == user;
             if !(has_name && entry.metadata().is_ok_and(is_ours)) {
                 continue;
@@ -307,19 +316,21 @@ mod with_network {
                 && let Ok(_lock) = run.lock()
             {
                 // What cannot be removed is left to the next host.
-                let _ = std::fs::remove_dir_all(entry.path());
+                let _ = run.remove();
             }
         }
     }
 
-    /// Removes everything but the log from the directory of a host that has failed.
+    /// Removes everything but the log from the directory of a host that has failed. The configuration is last: with it,
+    /// the next host finds a directory whose removal was interrupted.
     fn keep_log(run: &RunDir) {
         for entry in std::fs::read_dir(run.path()).into_iter().flatten().flatten() {
             let path = entry.path();
-            if path != run.log() {
+            if path != run.log() && path != run.config_file() {
                 let _ = std::fs::remove_file(&path).or_else(|_| std::fs::remove_dir_all(&path));
             }
         }
+        let _ = std::fs::remove_file(run.config_file());
     }
 
     /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.

@@ -85,11 +85,10 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if args.output.detach {
         return detach::resume_run(&args.run, &args.for_another_process(), &args.output);
     }
-    let run = RunDir::open(&args.run)?;
     // Only the holder of the lock may change the configuration.
-    let lock = run.lock()?;
+    let run = RunDir::open(&args.run)?.lock()?;
     let used = run.config()?;
-    launcher::wait_for_predecessors(&used.run.id, (&run, &lock))?;
+    launcher::wait_for_predecessors(&used.run.id, &run)?;
     let here = args.run.display();
     if run.replay_removed().exists() && !run.replay_file().exists() {
         bail!(
@@ -97,7 +96,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
              plot and film still work, and `shoal train … --from {here}` begins a new run with its networks"
         );
     }
-    if used.run.begins_with_others() && Origin::read(&run)?.is_none() {
+    if used.run.has_origin() && Origin::read(&run)?.is_none() {
         bail!("the start of {here} was interrupted before it had what it begins with: remove it and train again");
     }
     let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
@@ -147,7 +146,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if let Some(warning) = warning(config) {
         say(format!("warning: {warning}"));
     }
-    run_training(revision.config, &run, &lock, &args.output, &args.listen)
+    run_training(revision.config, &run, &args.output, &args.listen)
 }
 
 fn resume_suite(args: &ResumeArgs) -> anyhow::Result<ExitCode> {

@@ -9,7 +9,8 @@ use anyhow::{Context, bail};
 use clap::Args;
 use shoal_common::channel::Domain;
 use shoal_common::durable::write_atomically;
-use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir, RunDirError};
+use shoal_run::interrupted_start::remove_interrupted_start;
 use shoal_run::numbers::mebibytes;
 use shoal_run::suite::{self, Suite};
 use shoal_run::usage::UsageError;
@@ -31,8 +32,7 @@ pub(crate) struct RmArgs {
 
 /// A run to be removed. The lock keeps it from being started meanwhile.
 struct Removal {
-    run: RunDir,
-    lock: RunLock,
+    run: LockedRun,
     bytes: u64,
 }
 
@@ -47,7 +47,7 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
         }
         for path in paths {
             let run = RunDir::open(&path)?;
-            if runs.iter().any(|other| other.run == run) {
+            if runs.iter().any(|other| *other.run == run) {
                 bail!("{} is named twice: name each run once", path.display());
             }
             runs.push(prepare_removal(run, args.replay)?);
@@ -62,8 +62,8 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
         writeln!(std::io::stderr(), "nothing is removed")?;
         return Ok(ExitCode::FAILURE);
     }
-    for Removal { run, lock, bytes: size } in &runs {
-        lock.check(run)?;
+    for Removal { run, bytes: size } in &runs {
+        run.check()?;
         let here = run.path().display();
         if args.replay {
             remove_replay(run)?;
@@ -75,6 +75,10 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
     }
     for (path, _lock) in suites_to_go {
         let here = path.display();
+        // What is left of a start that was interrupted is not a run.
+        for trial in Suite::open(path)?.trials {
+            remove_interrupted_start(&path.join(trial.name))?;
+        }
         suite::remove(path).with_context(|| format!("cannot remove the suite {here}"))?;
         writeln!(std::io::stdout(), "removed the suite {here}")?;
     }
@@ -86,11 +90,11 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
 /// Locks a run to be removed, and checks that it can be.
 fn prepare_removal(run: RunDir, replay: bool) -> anyhow::Result<Removal> {
     let here = run.path().display();
-    let lock = run.lock().map_err(|error| match error {
+    let run = run.lock().map_err(|error| match error {
         RunDirError::Busy(_) => anyhow::anyhow!("{here} is running: end it first, with `shoal stop {here}`"),
         other => other.into(),
     })?;
-    // A `config.toml` alone may be anything.
+    // A file `config.toml` alone does not prove that this is a run.
     if let Err(error) = run.config() {
         bail!("{here} may not be a run, and is left as it is: {error}; to remove it nevertheless: rm -r {here}");
     }
@@ -103,7 +107,7 @@ fn prepare_removal(run: RunDir, replay: bool) -> anyhow::Result<Removal> {
     } else {
         size(run.path()).with_context(|| format!("cannot read {here}"))?
     };
-    Ok(Removal { run, lock, bytes })
+    Ok(Removal { run, bytes })
 }
 
 /// Asks on the terminal whether to go on.

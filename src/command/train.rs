@@ -87,7 +87,6 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let Plan {
         config,
         run,
-        lock,
         origin,
         warnings,
     } = Plan::new(what, &args.overrides)?;
@@ -102,7 +101,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         }
     }
     if args.output.detach {
-        drop(lock);
+        let run = run.unlock();
         let begun = detach::resume_run(run.path(), &args.listen.arguments(), &args.output);
         if let Ok(_lock) = run.lock()
             && !run.incarnations().exists()
@@ -111,10 +110,10 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         }
         return begun;
     }
-    run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
+    run_training(config, &run, &args.output, &args.listen).inspect_err(|_| {
         // If no process was started, the directory is removed, so that its name is free again. By now the path may
         // belong to somebody else.
-        if lock.check(&run).is_ok() && !run.incarnations().exists() {
+        if run.check().is_ok() && !run.incarnations().exists() {
             let _ = run.remove();
         }
     })

@@ -11,7 +11,7 @@ use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
 use shoal_common::message::{one_line, say};
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_env_server::environment::Goal;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
@@ -64,8 +64,7 @@ struct Summary {
 /// the result. This process owns the run until all of that is done.
 pub(crate) fn run_training(
     config: Config,
-    run: &RunDir,
-    lock: &RunLock,
+    run: &LockedRun,
     output: &OutputMode,
     listen: &ListenArgs,
 ) -> anyhow::Result<ExitCode> {
@@ -74,21 +73,20 @@ pub(crate) fn run_training(
         quiet: output.quiet,
         gate,
     };
-    let trained = train_and_report(config, run, lock, output, options);
+    let trained = train_and_report(config, run, output, options);
     // If the directory is gone, that explains every other error.
-    lock.check(run)?;
+    run.check()?;
     trained
 }
 
 fn train_and_report(
     config: Config,
-    run: &RunDir,
-    lock: &RunLock,
+    run: &LockedRun,
     output: &OutputMode,
     options: RunOptions,
 ) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
-    let outcome = launcher::run(config.clone(), (run, lock), &signals, options)?;
+    let outcome = launcher::run(config.clone(), run, &signals, options)?;
     let mut evaluated = Vec::new();
     let RunStatus {
         env_steps, episodes, ..
@@ -107,7 +105,7 @@ fn train_and_report(
                 }
             }
             Err(error) => {
-                lock.check(run)?;
+                run.check()?;
                 let why = match interrupt.signal() {
                     Some(signal) => format!("the final evaluation was ended by {}", describe(signal)),
                     None => format!("the final evaluation failed: {}", one_line(error)),
@@ -123,7 +121,7 @@ fn train_and_report(
         }
     }
     let interrupt = signals.interrupt();
-    // A run that is stopped should end soon, so that no environment is started for a figure.
+    // A run that was stopped should end soon, so no environment is started for a figure.
     let may_start = !evaluated.is_empty() && interrupt.signal().is_none();
     match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt)) {
         Ok(drawn) => {
@@ -132,7 +130,7 @@ fn train_and_report(
             }
         }
         Err(error) => {
-            lock.check(run)?;
+            run.check()?;
             say(format!("the figures could not be drawn: {}", one_line(error)));
         }
     }

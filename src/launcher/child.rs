@@ -385,11 +385,11 @@ mod tests {
                 self.child.record_at(&last, self.now + ready);
             }
             self.now += lived;
-            let consequence = self.child.handle_end_at(end, GIVE_UP_AFTER, self.now);
-            if let RestartDecision::Restart(pause) = consequence {
+            let decision = self.child.handle_end_at(end, GIVE_UP_AFTER, self.now);
+            if let RestartDecision::Restart(pause) = decision {
                 self.now += pause;
             }
-            consequence
+            decision
         }
 
         fn heartbeat(&self, activity: Activity, steps: u64) -> Heartbeat {
@@ -453,9 +453,9 @@ mod tests {
                 child.heartbeat(Activity::Working, 9),
             );
             for (ready, last) in [(None, idle), (Some(READY), idle), (Some(READY), at_work)] {
-                let consequence = child.live(10 * READY, ready, last, by_signal(KILLED));
+                let decision = child.live(10 * READY, ready, last, by_signal(KILLED));
                 let pause = if ready.is_some() { Duration::ZERO } else { FIRST_PAUSE };
-                assert_eq!(consequence, RestartDecision::Restart(pause));
+                assert_eq!(decision, RestartDecision::Restart(pause));
             }
         }
     }
@@ -481,11 +481,11 @@ mod tests {
             child.child.begin_at(child.now);
             child.child.kill_slow_start();
             child.now += READY;
-            let consequence = child.child.handle_end_at(by_signal(KILLED), GIVE_UP_AFTER, child.now);
-            if let RestartDecision::Restart(pause) = consequence {
+            let decision = child.child.handle_end_at(by_signal(KILLED), GIVE_UP_AFTER, child.now);
+            if let RestartDecision::Restart(pause) = decision {
                 child.now += pause;
             }
-            matches!(consequence, RestartDecision::GiveUp(_))
+            matches!(decision, RestartDecision::GiveUp(_))
         });
         assert!(given_up);
     }
@@ -496,8 +496,8 @@ mod tests {
             let mut child = Simulation::new(Role::EnvServer);
             let in_first_step = child.heartbeat(Activity::Working, 0);
             let given_up = (0..100).any(|_| {
-                let consequence = child.live(10 * READY, Some(READY), in_first_step, end);
-                matches!(consequence, RestartDecision::GiveUp(_))
+                let decision = child.live(10 * READY, Some(READY), in_first_step, end);
+                matches!(decision, RestartDecision::GiveUp(_))
             });
             assert!(given_up, "{end}");
         }
@@ -524,8 +524,8 @@ mod tests {
         let mut child = Simulation::new(Role::EnvServer);
         let at_work = child.heartbeat(Activity::Working, 3000);
         for _ in 0..1000 {
-            let consequence = child.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
-            assert_eq!(consequence, RestartDecision::Restart(FIRST_PAUSE));
+            let decision = child.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
+            assert_eq!(decision, RestartDecision::Restart(FIRST_PAUSE));
         }
     }
 }

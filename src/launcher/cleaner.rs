@@ -53,7 +53,7 @@ fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
 ///
 /// # Errors
 /// When the launcher has died, or files cannot be listed or removed.
-pub(crate) fn work(launcher: u32, run_id: &str) -> anyhow::Result<ExitCode> {
+pub(crate) fn run_in_child(launcher: u32, run_id: &str) -> anyhow::Result<ExitCode> {
     tie_to_parent(launcher)?;
     match Domain::clean_up(run_id)? {
         0 => Ok(ExitCode::SUCCESS),

@@ -10,6 +10,29 @@ use super::supervisor::Supervisor;
 /// How often to look for ended processes if nothing wakes the launcher.
 const REAP_INTERVAL: Duration = Duration::from_millis(100);
 
+/// How long to wait for a receiver that is being restarted when the roles are requested to end.
+const RESTART: Duration = Duration::from_secs(5);
+
+/// A request to end the roles, and how they will have ended then.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct EndRequest<End> {
+    at: Instant,
+    pub(super) end: End,
+}
+
+impl<End> EndRequest<End> {
+    /// A request that has just come.
+    pub(super) fn new(end: End) -> Self {
+        let at = Instant::now();
+        Self { at, end }
+    }
+
+    /// Whether the end may begin. A `receiver` of what the actors send that has just died is restarted first.
+    pub(super) fn may_begin(&self, supervisor: &Supervisor, receiver: Role) -> bool {
+        supervisor.is_ready(receiver) || self.at.elapsed() >= RESTART
+    }
+}
+
 /// A launcher, for ending its roles.
 pub(super) trait EndRoles {
     /// The processes of the roles, and where they find each other.
@@ -46,7 +69,7 @@ pub(super) trait EndRoles {
                 return false;
             }
             // If it cannot be started, the run must end all the same.
-            receiver = receiver.filter(|role| matches!(supervisor.start_again_if_dead(*role, domain), Ok(false)));
+            receiver = receiver.filter(|role| matches!(supervisor.restart_if_dead(*role, domain), Ok(false)));
             // An error here must not prevent the end.
             let _ = self.answer_requests();
             self.sleep(deadline.saturating_duration_since(Instant::now()).min(REAP_INTERVAL));

@@ -10,15 +10,15 @@ use shoal_common::config::Config;
 use shoal_common::message::one_line;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role};
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::LockedRun;
 use shoal_run::preflight;
 use shoal_run::signals::{self, Signals};
 
-use super::end_roles::EndRoles;
+use super::end_roles::{EndRequest, EndRoles};
 use super::log::Log;
 use super::stall::StallDetector;
 use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
-use super::{OTHERS_END, RESTART, write_iox_config};
+use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
 const TICK: Duration = Duration::from_millis(100);
@@ -41,21 +41,21 @@ pub(crate) enum JoinEnd {
     Interrupted(i32),
 }
 
-/// Works for the run until one of these endings. `config` and `run` are those of this host. `relay_runs` is called when
-/// the relay does; if it never does, it is dropped.
+/// Works for the run until one of these endings. `config` and `run` are those of this host. `on_relay_ready` is
+/// called after the relay's first heartbeat. If there is none, it is dropped without being called.
 pub(crate) fn run(
     config: Config,
-    (run, lock): (&RunDir, &RunLock),
+    run: &LockedRun,
     signals: &Signals,
     actors: Vec<u32>,
     give_up: Duration,
-    relay_runs: Box<dyn FnOnce()>,
+    on_relay_ready: Box<dyn FnOnce()>,
 ) -> anyhow::Result<JoinEnd> {
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
-        .and_then(|()| JoinedLauncher::new(config, (run, lock), &domain, signals, actors))
-        .and_then(|launcher| launcher.run(give_up, relay_runs));
+        .and_then(|()| JoinedLauncher::new(config, run, &domain, signals, actors))
+        .and_then(|launcher| launcher.run(give_up, on_relay_ready));
     // Also after an error: no role is left by now.
     let left = domain.leave();
     let ending = ending?;
@@ -65,8 +65,7 @@ pub(crate) fn run(
 
 struct JoinedLauncher<'a> {
     config: Config,
-    run: &'a RunDir,
-    lock: &'a RunLock,
+    run: &'a LockedRun,
     domain: &'a Domain,
     control: ControlPort,
     supervisor: Supervisor,
@@ -74,8 +73,8 @@ struct JoinedLauncher<'a> {
     stalls: StallDetector,
     log: Log,
     heartbeats: Reports<Heartbeat>,
-    /// The first request to end the work, with its time.
-    end_request: Option<(Instant, JoinEnd)>,
+    /// The first request to end the work.
+    end_request: Option<EndRequest<JoinEnd>>,
     has_lost_actors: bool,
     /// Since when the relay has had no connection.
     cut_off_since: Option<Instant>,
@@ -84,7 +83,7 @@ struct JoinedLauncher<'a> {
 impl<'a> JoinedLauncher<'a> {
     fn new(
         config: Config,
-        (run, lock): (&'a RunDir, &'a RunLock),
+        run: &'a LockedRun,
         domain: &'a Domain,
         signals: &'a Signals,
         actors: Vec<u32>,
@@ -99,7 +98,6 @@ impl<'a> JoinedLauncher<'a> {
             stalls: StallDetector::of_joined_host(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
-            lock,
             domain,
             signals,
             log,
@@ -110,10 +108,11 @@ impl<'a> JoinedLauncher<'a> {
         })
     }
 
-    fn run(mut self, give_up: Duration, relay_runs: Box<dyn FnOnce()>) -> anyhow::Result<JoinEnd> {
-        // If it is not called, it is dropped at the end: a relay that begins to run meanwhile needs the host's actors.
-        let mut relay_runs = Some(relay_runs);
-        let ending = self.watch(give_up, &mut relay_runs);
+    fn run(mut self, give_up: Duration, on_relay_ready: Box<dyn FnOnce()>) -> anyhow::Result<JoinEnd> {
+        // Kept until the end of this function: dropping it gives the host's actors back, and a relay that starts meanwhile
+        // still needs them.
+        let mut on_relay_ready = Some(on_relay_ready);
+        let ending = self.watch(give_up, &mut on_relay_ready);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
@@ -133,7 +132,7 @@ impl<'a> JoinedLauncher<'a> {
         ending
     }
 
-    fn watch(&mut self, give_up: Duration, relay_runs: &mut Option<Box<dyn FnOnce()>>) -> anyhow::Result<JoinEnd> {
+    fn watch(&mut self, give_up: Duration, on_relay_ready: &mut Option<Box<dyn FnOnce()>>) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received()
@@ -141,13 +140,19 @@ impl<'a> JoinedLauncher<'a> {
             {
                 let what = format!("{} ends the work for the run", signals::describe(signal));
                 self.log.note("launcher", &what);
-                self.end_request = Some((Instant::now(), JoinEnd::Interrupted(signal)));
+                self.end_request = Some(EndRequest::new(JoinEnd::Interrupted(signal)));
             }
-            self.lock.check(self.run)?;
+            self.run.check()?;
             self.read_heartbeats()?;
             self.answer_requests()?;
-            match self.supervisor.maintain(self.domain)? {
+            let condition = match (self.supervisor.maintain(self.domain), self.end_request) {
+                // A host that is about to end needs no role that cannot work.
+                (Err(_), Some(request)) => return Ok(request.end),
+                (condition, _) => condition?,
+            };
+            match condition {
                 RunCondition::AtWork => {}
+                RunCondition::SharedMemoryOccupied | RunCondition::FilesRemoved if self.end_request.is_some() => {}
                 RunCondition::LearnerDone => bail!("a learner has ended on a host that has none"),
                 RunCondition::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
                 RunCondition::FilesRemoved => bail!(
@@ -155,31 +160,25 @@ impl<'a> JoinedLauncher<'a> {
                     self.domain.directory()?.display()
                 ),
             }
-            for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
-                self.log.note("launcher", &stalled);
-            }
-            for slow in self.supervisor.report_slow(&self.stalls) {
-                self.log.note("launcher", &slow);
-            }
-            // A relay that has just died is restarted first, so that it passes on what the actors have sent.
-            if let Some((at, ending)) = self.end_request
-                && (self.supervisor.is_ready(Role::Relay) || at.elapsed() >= RESTART)
+            self.supervisor.check_progress(&mut self.stalls);
+            if let Some(request) = self.end_request
+                && request.may_begin(&self.supervisor, Role::Relay)
             {
-                return Ok(ending);
+                return Ok(request.end);
             }
-            if self.has_lost_actors {
+            if self.has_lost_actors && self.end_request.is_none() {
                 return Ok(JoinEnd::LostActors);
             }
             let activity = self.supervisor.activity(Role::Relay);
-            if let Some(relay_runs) = relay_runs.take_if(|_| activity.is_some()) {
-                relay_runs();
+            if let Some(on_relay_ready) = on_relay_ready.take_if(|_| activity.is_some()) {
+                on_relay_ready();
             }
             match activity {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
                 Some(Activity::Working) => self.cut_off_since = None,
                 _ => {
                     let since = self.cut_off_since.get_or_insert_with(Instant::now);
-                    if since.elapsed() >= give_up {
+                    if since.elapsed() >= give_up && self.end_request.is_none() {
                         return Ok(JoinEnd::GaveUp);
                     }
                 }
@@ -213,7 +212,7 @@ impl EndRoles for JoinedLauncher<'_> {
             config,
             ..
         } = self;
-        control.answer_requests(run.key()?, run.path(), |request| {
+        control.answer_requests(run.directory_id()?, run.path(), |request| {
             Ok::<_, anyhow::Error>(match request {
                 ControlRequest::Status => Some(ControlResponse::Status(RunStatus {
                     roles: supervisor.status(0),
@@ -222,7 +221,7 @@ impl EndRoles for JoinedLauncher<'_> {
                     ..RunStatus::default()
                 })),
                 ControlRequest::Stop => {
-                    end_request.get_or_insert_with(|| (Instant::now(), JoinEnd::Stopped));
+                    end_request.get_or_insert_with(|| EndRequest::new(JoinEnd::Stopped));
                     None
                 }
                 ControlRequest::Replace { actor, incarnation } => {

@@ -4,9 +4,6 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{HostLease, HostState, HostStatus};
 
-/// Incarnations that a host gets at once: more than it will ever need.
-pub(super) const INCARNATIONS: u64 = 1 << 20;
-
 /// The hosts that have joined.
 #[derive(Debug)]
 pub(super) struct JoinedHosts {

@@ -18,8 +18,8 @@ const KEPT: usize = 5;
 
 /// Size of the log, in bytes, above which lines of other programs are left out. Each launcher accepts at least the
 /// second number of bytes from them. Shoal's own lines have no limit.
-const FOR_PROGRAMS: u64 = 16 * 1024 * 1024;
-const LEAST_FOR_PROGRAMS: u64 = 1024 * 1024;
+const MAX_LOG_BYTES: u64 = 16 * 1024 * 1024;
+const MIN_PROGRAM_BYTES: u64 = 1024 * 1024;
 
 /// The launcher's line after all roles have ended.
 pub(crate) const ALL_ENDED: &str = "every role has ended";
@@ -43,7 +43,7 @@ struct Inner {
     file: File,
     last: HashMap<String, VecDeque<KeptLine>>,
     /// Bytes that other programs may still write.
-    for_programs: u64,
+    program_bytes_left: u64,
 }
 
 /// A line that a process has written.
@@ -65,7 +65,7 @@ impl Log {
         Ok(Self(Arc::new(Mutex::new(Inner {
             file,
             last: HashMap::new(),
-            for_programs: FOR_PROGRAMS.saturating_sub(length).max(LEAST_FOR_PROGRAMS),
+            program_bytes_left: MAX_LOG_BYTES.saturating_sub(length).max(MIN_PROGRAM_BYTES),
         }))))
     }
 
@@ -87,7 +87,7 @@ impl Log {
             }
             Line::TooMuch(text) => inner.remember(who, text, false),
             // The log already says that it takes no more lines of programs.
-            Line::LeftOut(_) if inner.for_programs == 0 => {}
+            Line::LeftOut(_) if inner.program_bytes_left == 0 => {}
             Line::LeftOut(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
         }
     }
@@ -119,13 +119,13 @@ impl Inner {
     /// Whether the log has room for this line of another program. Logs once that it has none.
     fn takes(&mut self, line: &str) -> bool {
         let length = line.len() as u64 + 1;
-        if self.for_programs > 0 && self.for_programs < length {
+        if self.program_bytes_left > 0 && self.program_bytes_left < length {
             let what = "this log takes no more of what other programs write to standard error (SHOAL_LOG=debug logs everything)";
             self.write("launcher", what);
-            self.for_programs = 0;
+            self.program_bytes_left = 0;
         }
-        self.for_programs = self.for_programs.saturating_sub(length);
-        self.for_programs > 0
+        self.program_bytes_left = self.program_bytes_left.saturating_sub(length);
+        self.program_bytes_left > 0
     }
 
     fn remember(&mut self, who: &str, text: &str, is_in_log: bool) {
@@ -203,7 +203,7 @@ mod tests {
         }
         log.line("env-server-0", Line::Kept("ValueError: too hot"), Writer::Program);
         log.line("learner-0", Line::Kept("mine"), Writer::Shoal);
-        assert!((FOR_PROGRAMS - 5000..FOR_PROGRAMS + 500_000).contains(&(text().len() as u64)));
+        assert!((MAX_LOG_BYTES - 5000..MAX_LOG_BYTES + 500_000).contains(&(text().len() as u64)));
         assert!(!text().contains("too hot") && text().contains("mine"));
         assert_eq!(text().matches("this log takes no more").count(), 1);
         assert_eq!(log.last_lines("env-server-0").pop().unwrap(), "ValueError: too hot");

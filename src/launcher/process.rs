@@ -76,7 +76,7 @@ pub(super) fn name(instance: RoleInstance) -> String {
 }
 
 /// How a process has ended.
-pub(super) fn ending(status: ExitStatus) -> String {
+pub(super) fn describe_exit(status: ExitStatus) -> String {
     match (status.signal(), status.code()) {
         (Some(signal), _) => format!("killed by signal {signal}"),
         (_, Some(code)) => format!("ended with exit code {code}"),

@@ -1,10 +1,11 @@
 //! The live line; or, where standard error is no terminal, a plain line for each evaluation.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_common::config::{Config, ReplayConfig};
+use shoal_common::message::say;
 use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
@@ -88,7 +89,7 @@ impl ProgressLine {
     pub(super) fn set_evaluation(&mut self, report: &EvaluationReport, is_new: bool) {
         self.evaluated = Some(*report);
         if self.plain && is_new {
-            say(&self.evaluation_line(report));
+            say(self.evaluation_line(report));
         }
     }
 
@@ -196,26 +197,21 @@ impl ProgressLine {
     }
 }
 
-/// The ratio of updates to environment steps beside the agreed one, and why it is lower at first.
+/// The ratio of updates to environment steps beside the configured one, and why it is lower at first.
 fn ratio_in_words(replay: &ReplayConfig, updates: u64, env_steps: u64) -> String {
-    let agreed = replay.updates_per_step;
+    let configured = replay.updates_per_step;
     let Some(ratio) = replay.ratio(updates, env_steps) else {
         let (steps, warmup) = (thousands(env_steps), thousands(replay.ratio_start()));
-        return format!("warm-up: {steps} of {warmup} steps, then ratio {agreed:.2}");
+        return format!("warm-up: {steps} of {warmup} steps, then ratio {configured:.2}");
     };
-    let stated = format!("ratio {ratio:.2} of {agreed:.2}");
-    if ratio >= NEARLY * agreed {
+    let stated = format!("ratio {ratio:.2} of {configured:.2}");
+    if ratio >= NEARLY * configured {
         return stated;
     }
     format!(
         "{stated} (rising: actors may be {} steps ahead)",
         thousands(replay.tolerance)
     )
-}
-
-/// Writes a line to standard error. One that is closed must not end the run.
-fn say(line: &str) {
-    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 #[cfg(test)]

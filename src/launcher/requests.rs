@@ -38,8 +38,8 @@ pub(super) fn status(
     status.roles = supervisor.status(status.policy_version);
     status.hosts = supervisor.joined_hosts();
     status.waiting = waiting(supervisor).map(|who| {
-        let (ratio, agreed) = (status.ratio, status.updates_per_step);
-        format!("{who}: ratio {ratio:.2} of {agreed:.2}")
+        let (ratio, configured) = (status.ratio, status.updates_per_step);
+        format!("{who}: ratio {ratio:.2} of {configured:.2}")
     });
     Ok(status)
 }

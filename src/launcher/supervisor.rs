@@ -14,7 +14,7 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_common::channel::control::{ControlPort, RoleStatus};
+use shoal_common::channel::control::{ControlPort, HostLease, RoleStatus};
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
@@ -30,9 +30,9 @@ use self::cleaning::Cleaning;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
 use super::incarnations::{last_committed, read_counter};
-use super::joined_hosts::{INCARNATIONS, JoinedHosts};
+use super::joined_hosts::JoinedHosts;
 use super::log::Log;
-use super::process::{Process, ending, name};
+use super::process::{Process, describe_exit, name};
 use super::stall::StallDetector;
 use crate::log_level::log_level;
 
@@ -41,7 +41,7 @@ const SLOW_START: Duration = Duration::from_secs(10);
 
 /// More incarnations than are used between two committed chunks, those of other hosts included. If the counter is lost,
 /// this many are skipped.
-const STARTS_WITHOUT_CHUNK: u64 = 64 * INCARNATIONS;
+const STARTS_WITHOUT_CHUNK: u64 = 64 * HostLease::INCARNATIONS;
 
 /// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -241,29 +241,37 @@ impl Supervisor {
     /// When it cannot be started.
     pub(super) fn ensure_gate(&mut self, domain: &Domain) -> anyhow::Result<()> {
         if !self.joined_hosts.leases().is_empty() {
-            self.start_again_if_dead(Role::Gate, domain)?;
+            self.restart_if_dead(Role::Gate, domain)?;
         }
         Ok(())
     }
 
-    /// Starts the only process of a role again if it has died without having finished. Returns whether it had.
+    /// Restarts the only process of a role if it has died; a learner only if it had not finished. Returns whether it was
+    /// restarted.
     ///
     /// # Errors
     /// When it cannot be started.
-    pub(super) fn start_again_if_dead(&mut self, role: Role, domain: &Domain) -> anyhow::Result<bool> {
+    pub(super) fn restart_if_dead(&mut self, role: Role, domain: &Domain) -> anyhow::Result<bool> {
         self.reap(|which| which == role);
         let is_dead = |child: &Child| child.is(role, 0) && child.process.is_none();
         let Some(i) = self.children.iter().position(is_dead) else {
             return Ok(false);
         };
-        if role == Role::Learner {
-            if self.learner_done {
-                return Ok(false);
-            }
-            self.unsaved_learner = None;
+        // Without its files, the clean-up and the successor would find those of another run, or none.
+        if role == Role::Learner && self.learner_done || !domain.is_intact(self.services.count()) {
+            return Ok(false);
+        }
+        if let Some(status) = self.children[i].ended.take() {
+            self.log.note(
+                &name(self.children[i].instance),
+                &format!("{}; restarting it", describe_exit(status)),
+            );
+            self.note_incident(i, kind_of_end(status), describe_exit(status));
         }
         self.cleaning.clean(domain, &self.services, &self.log);
+        self.children[i].restarts += 1;
         self.start(i)?;
+        self.unsaved_learner = None;
         self.note_incident(i, IncidentKind::StartedAgain, String::new());
         Ok(true)
     }
@@ -420,22 +428,17 @@ impl Supervisor {
         if child.is_retiring {
             child.process = None;
             child.restart_at = Instant::now();
-            self.log.note(&name, &format!("retired: {}", ending(status)));
+            self.log.note(&name, &format!("retired: {}", describe_exit(status)));
             self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(RunCondition::AtWork);
         }
         let decision = child.handle_end(status, self.give_up_after);
-        let what = if status.signal().is_some() {
-            IncidentKind::Killed
-        } else {
-            IncidentKind::Failed
-        };
-        self.note_incident(i, what, ending(status));
+        self.note_incident(i, kind_of_end(status), describe_exit(status));
         match decision {
             RestartDecision::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
-                    .note(&name, &format!("{}; restarting it in {pause:?}", ending(status)));
+                    .note(&name, &format!("{}; restarting it in {pause:?}", describe_exit(status)));
                 Ok(RunCondition::AtWork)
             }
             RestartDecision::GiveUp(starts) => {
@@ -445,8 +448,18 @@ impl Supervisor {
         }
     }
 
+    /// Replaces stalled processes, and reports slow ones. Returns a message for each, which is also in the log.
+    pub(super) fn check_progress(&mut self, stalls: &mut StallDetector) -> Vec<String> {
+        let mut messages = self.replace_stalled(stalls);
+        messages.extend(self.report_slow(stalls));
+        for message in &messages {
+            self.log.note("launcher", message);
+        }
+        messages
+    }
+
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
-    pub(super) fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
+    fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
         let stalled = stalls.find(&mut self.children, self.cleaning.take_time());
         let mut messages = Vec::new();
         for (i, why) in stalled {
@@ -465,7 +478,7 @@ impl Supervisor {
 
     /// Messages about slow processes, one for each: environment servers in one step or reset, and roles that are
     /// starting. An environment's program that is not ready in time is ended, which counts as a failure.
-    pub(super) fn report_slow(&mut self, stalls: &StallDetector) -> Vec<String> {
+    fn report_slow(&mut self, stalls: &StallDetector) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
@@ -510,8 +523,16 @@ impl Supervisor {
         bail!(
             "{name} failed {starts} times and is given up ({}): {message}; see shoal.log in the run's directory, fix \
              the cause, then `shoal resume {}` continues the run",
-            ending(status),
+            describe_exit(status),
             self.run.display()
         );
+    }
+}
+
+/// The kind of incident that the end of a process with this status is.
+fn kind_of_end(status: ExitStatus) -> IncidentKind {
+    match status.signal() {
+        Some(_) => IncidentKind::Killed,
+        None => IncidentKind::Failed,
     }
 }

@@ -180,7 +180,7 @@ refused(lambda: lakes.to_minari("lake/two-v0"), "2 actors", "--actors 1 --envs 1
 # What cannot be.
 pendulum = lambda **more: shoal.train("pendulum", run="new", steps=100, quiet=True, **more)  # noqa: E731
 refused(lambda: alone.to_minari("pendulum/alone-v0"), "exists already")
-refused(lambda: alone.to_minari("no version"), "no name of a dataset")
+refused(lambda: alone.to_minari("no version"), "not a dataset's name")
 refused(lambda: pendulum(demonstrations="pendulum/none-v0"), "there is no dataset pendulum/none-v0")
 refused(lambda: pendulum(demonstrations="cart/random-v0"), "the space of its observations is")
 refused(

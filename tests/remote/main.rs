@@ -59,7 +59,7 @@ struct Host {
 }
 
 impl Host {
-    /// Joins with this number of actors, and waits until all roles of the host are ready.
+    /// Joins with these arguments, and waits until all roles of the host are ready.
     fn join(run: &Run, arguments: &[&str]) -> Self {
         let place = Workplace::logging_chunks();
         let endpoint = run.endpoint();
@@ -92,6 +92,14 @@ fn stop(run: Run) -> std::path::PathBuf {
     // The run's directory must outlive its workplace.
     std::mem::forget(run.place);
     path
+}
+
+/// Waits for the end of this run, which `stop` asks for.
+fn ends_as_stopped(run: Run, mut stop: std::process::Child) {
+    until("the run is stopped", || stop.try_wait().unwrap().is_some());
+    assert!(stop.wait().unwrap().success());
+    let Run { place, running } = run;
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
 }
 
 /// Rows of these actors in the replay.
@@ -302,7 +310,7 @@ fn hosts_end_with_a_run_whose_gate_dies_while_it_tells_them() {
     // So that the gate has to wait.
     host.running.stop_role("relay-0");
     let actor = run.running.pids("actor-0")[0];
-    let mut stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    let stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
     until("the actor has ended", || {
         !run.running.leftovers().processes().contains(&actor)
     });
@@ -310,10 +318,7 @@ fn hosts_end_with_a_run_whose_gate_dies_while_it_tells_them() {
     run.running.kill_if_alive("gate-0");
     until("there is another gate", || run.running.pids("gate-0").len() == 2);
     host.running.continue_role("relay-0");
-    until("the run is stopped", || stop.try_wait().unwrap().is_some());
-    assert!(stop.wait().unwrap().success());
-    let Run { place, running } = run;
-    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    ends_as_stopped(run, stop);
     host.ends_with(0);
 }
 
@@ -345,8 +350,80 @@ fn hosts_end_with_a_run_that_is_stopped_while_it_moves_to_new_shared_memory() {
     until("new shared memory is reported", || {
         run.running.log().contains("continues in new shared memory")
     });
-    stop(run);
+    // The launcher learns of the request before the actors have ended.
+    run.running.signal(Signal::STOP);
+    let stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(300));
+    run.running.signal(Signal::CONT);
+    ends_as_stopped(run, stop);
     host.ends_with(0);
+}
+
+#[test]
+fn hosts_end_with_a_run_that_is_interrupted_while_it_moves_to_new_shared_memory() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[1]);
+    run.running.kill_beyond_cleaning("actor-0");
+    until("new shared memory is reported", || {
+        run.running.log().contains("continues in new shared memory")
+    });
+    run.running.signal(Signal::TERM);
+    let Run { place, running } = run;
+    assert_eq!(running.wait().0, Some(128 + 15), "{}", place.stderr());
+    host.ends_with(0);
+}
+
+#[test]
+fn hosts_end_with_a_run_that_ends_before_they_are_admitted_again() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[1]);
+    let endpoint = run.endpoint();
+    host.running.stop_role("relay-0");
+    run.running.signal(Signal::KILL);
+    let Run { place, running } = run;
+    running.wait_for_launcher();
+    let running = place.resume("run", &["--listen", &endpoint]);
+    let stop = place.shoal(&["stop", "run"]).spawn().unwrap();
+    host.running.continue_role("relay-0");
+    ends_as_stopped(Run { place, running }, stop);
+    host.ends_with(0);
+}
+
+#[test]
+fn a_host_whose_run_ends_before_it_has_begun_ends_with_it() {
+    let run = Run::start(&["--actors", "1"]);
+    let place = Workplace::new();
+    let join = ["join", &run.endpoint(), "--actors", "1"];
+    let mut host = place.shoal(&join).env("TMPDIR", place.path()).spawn().unwrap();
+    until("it is admitted", || run.running.log().contains("is admitted"));
+    kill_process(Pid::from_child(&host), Signal::STOP).unwrap();
+    let stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    until("the run is ending", || run.running.log().contains("ends the run"));
+    kill_process(Pid::from_child(&host), Signal::CONT).unwrap();
+    ends_as_stopped(run, stop);
+    until("the host has ended", || host.try_wait().unwrap().is_some());
+    assert_eq!(host.wait().unwrap().code(), Some(0));
+}
+
+#[test]
+fn a_gate_that_cannot_be_started_at_the_end_does_not_keep_the_learner_from_saving() {
+    let run = Run::start(&["--actors", "1"]);
+    let _host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[0, 1]);
+    run.running.signal(Signal::STOP);
+    run.running.kill("gate-0");
+    let counter = run.running.run.join("incarnations");
+    std::fs::remove_file(&counter).unwrap();
+    std::fs::create_dir(&counter).unwrap();
+    run.running.signal(Signal::TERM);
+    run.running.signal(Signal::CONT);
+    let Run { place, running } = run;
+    let path = running.run.clone();
+    assert_eq!(running.wait().0, Some(1), "{}", place.stderr());
+    assert!(place.stderr().contains("incarnations"), "{}", place.stderr());
+    assert_eq!(in_replay(&path, &[0]), sent(&path, 0));
 }
 
 #[test]
@@ -357,13 +434,10 @@ fn hosts_end_with_a_run_whose_gate_has_just_died() {
     // The launcher learns of the death and of the request at the same time.
     run.running.signal(Signal::STOP);
     run.running.kill_if_alive("gate-0");
-    let mut stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    let stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
     std::thread::sleep(Duration::from_millis(300));
     run.running.signal(Signal::CONT);
-    until("the run is stopped", || stop.try_wait().unwrap().is_some());
-    assert!(stop.wait().unwrap().success());
-    let Run { place, running } = run;
-    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    ends_as_stopped(run, stop);
     host.ends_with(0);
 }
 
@@ -536,10 +610,16 @@ fn a_host_that_ends_before_its_relay_runs_gives_its_actors_back() {
     // A signal comes before the answer of the run.
     run.running.signal(Signal::STOP);
     let mut ended = place.shoal(&join).env("TMPDIR", place.path()).spawn().unwrap();
+    until("it receives signals", || {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", ended.id())).unwrap_or_default();
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:\t"));
+        caught.is_some_and(|mask| u64::from_str_radix(mask, 16).unwrap() & 1 << (15 - 1) != 0)
+    });
     std::thread::sleep(Duration::from_secs(1));
     kill_process(Pid::from_child(&ended), Signal::TERM).unwrap();
     run.running.signal(Signal::CONT);
     until("join has ended", || ended.try_wait().unwrap().is_some());
+    assert_eq!(ended.wait().unwrap().code(), Some(128 + 15));
     until("the host has left", all_have_left);
     assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0);
     stop(run);
@@ -810,7 +890,10 @@ fn what_cannot_be_joined_is_refused_in_one_line() {
     assert_eq!(code(&nobody), Some(4));
     assert!(error_line(&output(&nobody)).contains("nobody answers at tcp/127.0.0.1:9"));
     // No endpoints.
-    for (endpoint, why) in [("here", "is no endpoint"), ("tcp/10.1.2.3:7447", "without encryption")] {
+    for (endpoint, why) in [
+        ("here", "is not an endpoint"),
+        ("tcp/10.1.2.3:7447", "without encryption"),
+    ] {
         let join = ["join", endpoint, "--actors", "1"];
         assert_eq!(code(&join), Some(2));
         assert!(error_line(&output(&join)).contains(why));

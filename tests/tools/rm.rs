@@ -50,6 +50,9 @@ fn a_suite_is_named_before_it_is_removed() {
     let trial = r#"{"name": "seed=1", "seed": 1, "set": []}"#;
     let written = format!(r#"{{"format": 1, "what": "pendulum", "arguments": [], "trials": [{trial}]}}"#);
     std::fs::write(suite.join("suite.json"), written).unwrap();
+    // A start that was interrupted.
+    std::fs::create_dir(suite.join("seed=1")).unwrap();
+    std::fs::write(suite.join("seed=1/config.toml.new"), "").unwrap();
     let no_replays = error_line(&place.output(&["rm", "--replay", "--yes", "suite"]));
     assert!(no_replays.contains("suite has no runs, so"), "{no_replays}");
     let mut terminal = Terminal::start(&place, &["rm", "suite"], true);

@@ -13,7 +13,7 @@ use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Li
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::role::{Activity, Role, RoleInstance};
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::{HostFile, JoinFile, KeyFile};
 use shoal_remote::keys::{self, Keys, VALID};
@@ -43,9 +43,6 @@ const PAUSE: Duration = Duration::from_micros(100);
 
 /// How late the loop may be because it has slept.
 const LATE: Duration = Duration::from_millis(1);
-
-/// Incarnations of a host.
-const INCARNATIONS: u64 = 1 << 20;
 
 /// What lies between the learner's host and the others.
 #[derive(Debug)]
@@ -110,7 +107,7 @@ impl Launcher<'_> {
         self.heartbeat.beat(Activity::Working);
         let leases = &self.leases;
         self.control
-            .answer_requests(self.run.key()?, self.run.path(), |request| {
+            .answer_requests(self.run.directory_id()?, self.run.path(), |request| {
                 Ok::<_, ChannelError>(Some(match request {
                     ControlRequest::Hosts(_) => ControlResponse::Leases {
                         epoch: 1,
@@ -141,7 +138,7 @@ struct JoinedHost {
     _services: Services,
     domain: Domain,
     config: Config,
-    _lock: RunLock,
+    _run: LockedRun,
 }
 
 impl<'a> RemoteRun<'a> {
@@ -184,8 +181,8 @@ impl<'a> RemoteRun<'a> {
             name: format!("host-{host}"),
             epoch: 1,
             actors: (host * actors..(host + 1) * actors).collect(),
-            first_incarnation: (u64::from(host) + 1) * INCARNATIONS,
-            limit: (u64::from(host) + 2) * INCARNATIONS,
+            first_incarnation: (u64::from(host) + 1) * HostLease::INCARNATIONS,
+            limit: (u64::from(host) + 2) * HostLease::INCARNATIONS,
         };
         let mut services = Services::new(domain)?;
         // Those of the run's own actors exist.
@@ -390,7 +387,7 @@ impl JoinedHost {
             limit: lease.limit,
         };
         let path = run.directory.path().join(&lease.name);
-        let (config, directory, lock) =
+        let (config, directory) =
             make_host_directory(&path, &wire.config, lease.first_incarnation, Interrupt::default())?;
         let endpoint = JoinFile::read(run.temporary.run.path())?.endpoint;
         key.write(&directory.path().join(KeyFile::JOIN))?;
@@ -421,7 +418,7 @@ impl JoinedHost {
             _services: services,
             domain,
             config,
-            _lock: lock,
+            _run: directory,
         })
     }
 

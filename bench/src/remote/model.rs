@@ -173,7 +173,7 @@ mod tests {
         // 1,024 actors offer a million chunks a second, and the learner's link carries 50,000.
         let many = COSTS.throughput(32, 32);
         assert!((0.98 * 5e4..=5e4).contains(&many), "{many}");
-        // Sixteen hosts with their own links would not help, one whose link is slow would be the limit.
+        // With slow host links, the links are the limit: four of them carry 4,000 chunks a second.
         let slow = Costs {
             host_link: 1e-3,
             ..COSTS

@@ -114,7 +114,7 @@ impl Training {
 
     /// Observes the run until the first policy that gradient steps have changed.
     pub(super) fn begin(&mut self, budget: &TimeBudget) -> anyhow::Result<Startup> {
-        let run = RunDir::planned(&self.directory.path().join("run"));
+        let run = RunDir::at(&self.directory.path().join("run"));
         let begun = self.started_at;
         // Joining before the launcher would look like the remains of an earlier run. The launcher writes this file
         // before it starts the first process, and has created the services by then.
@@ -169,10 +169,10 @@ impl Training {
     }
 
     /// Role, index and process id of every process.
-    pub(super) fn members(&self) -> anyhow::Result<Vec<(String, u32, u32)>> {
+    pub(super) fn processes(&self) -> anyhow::Result<Vec<(String, u32, u32)>> {
         let status = self.observer()?.client.status()?.context("the training has ended")?;
-        let members = status.roles.into_iter();
-        Ok(members
+        let processes = status.roles.into_iter();
+        Ok(processes
             .filter_map(|role| Some((role.role, role.index, role.pid?)))
             .collect())
     }

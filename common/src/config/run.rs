@@ -58,7 +58,7 @@ pub enum Mode {
 
 impl RunConfig {
     /// Whether the run begins with another run's networks or with a dataset's rows.
-    pub fn begins_with_others(&self) -> bool {
+    pub fn has_origin(&self) -> bool {
         self.from.is_some() || self.demonstrations.is_some()
     }
 

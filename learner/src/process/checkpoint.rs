@@ -291,10 +291,7 @@ impl Checkpoints {
         let body = match durable::read_sealed(KIND, &path) {
             Ok(body) => body,
             Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(CheckpointFile::Missing),
-            // Only a broken disk is damage. Other reasons may pass, such as too many open files.
-            Err(SealError::Io(source)) if source.raw_os_error() != Some(Errno::IO.raw_os_error()) => {
-                return Err(CheckpointError::Read { path, source });
-            }
+            Err(SealError::Io(source)) if !is_damage(&source) => return Err(CheckpointError::Read { path, source }),
             Err(error @ SealError::Version { .. }) => return Err(refused(error.to_string())),
             Err(error) => return Ok(CheckpointFile::Damaged(error.to_string())),
         };
@@ -317,6 +314,11 @@ impl Checkpoints {
 
 /// No run reaches this many updates, rows, episodes or versions, and counting further from here does not overflow.
 const LIMIT: u64 = 1 << 60;
+
+/// Whether this is the error of a broken disk or file system. Other reasons may pass, such as too many open files.
+fn is_damage(error: &io::Error) -> bool {
+    Errno::from_io_error(error).is_some_and(|errno| [Errno::IO, Errno::UCLEAN, Errno::BADMSG].contains(&errno))
+}
 
 /// Splits a body into its header and the numbers of each array; `None` unless the lengths add up to the body's and
 /// all counters are below `LIMIT`.

@@ -210,10 +210,10 @@ impl<'a> Learner<'a> {
     /// that they allow.
     pub(crate) fn take_last_chunks(&mut self) -> Result<(), LearnerError> {
         let begun = Instant::now();
-        let mut quiet = begun;
-        while quiet.elapsed() < QUIET_TIME && begun.elapsed() < LAST_CHUNKS_TIMEOUT {
+        let mut last_chunk_at = begun;
+        while last_chunk_at.elapsed() < QUIET_TIME && begun.elapsed() < LAST_CHUNKS_TIMEOUT {
             if self.intake.drain(&mut self.replay, u32::MAX, |_| false)? {
-                quiet = Instant::now();
+                last_chunk_at = Instant::now();
             } else {
                 self.listener.wait(Duration::from_millis(10))?;
             }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use shoal_env_server::frame::Image;
-use shoal_run::signals::Interrupt;
+use shoal_run::signals::{self, Interrupt};
 use tempfile::TempDir;
 
 /// The program's name.
@@ -136,7 +136,7 @@ impl Ffmpeg {
 /// Waits for a moment, unless a signal has arrived or it has lasted too long.
 fn pause(since: Instant, interrupt: &Interrupt) -> anyhow::Result<()> {
     if let Some(signal) = interrupt.signal() {
-        bail!("ended by signal {signal}");
+        bail!("ended by {}", signals::describe(signal));
     }
     if since.elapsed() > PATIENCE {
         bail!("ffmpeg has not gone on for {} s", PATIENCE.as_secs());

@@ -47,7 +47,7 @@ pub(super) struct Run {
     final_evaluation: Option<FinalPolicyResult>,
     evaluations: Curve,
     exploration: Curve,
-    learner: Rates,
+    learner: LearnerCurves,
     incidents: Option<Incidents>,
     /// The hosts that have joined.
     hosts: Vec<JoinedHost>,
@@ -98,12 +98,12 @@ struct Curve {
     counts: Vec<usize>,
 }
 
-/// Rates measured over a shorter time, in s, are not shown: they are not meaningful.
+/// LearnerCurves measured over a shorter time, in s, are not shown: they are not meaningful.
 const SPAN: f64 = 0.2;
 
 /// The learner's records, averaged if there are more than the page may contain. NaN where nothing was recorded.
 #[derive(Clone, Debug, Serialize)]
-struct Rates {
+struct LearnerCurves {
     steps: Vec<u64>,
     /// In s.
     time: Vec<f64>,
@@ -130,7 +130,7 @@ impl Run {
         // Before the records: if the run ends now, its last records are read below.
         let is_training = run.is_running()?;
         let evaluation_records = read_evaluations(&run.evaluations())?;
-        let learner = read_learner(&run.learner_log())?;
+        let learner = read_learner(&run.learner_records())?;
         let explored = read_episodes(&run.episodes())?;
         let mut now = learner.last().cloned().unwrap_or_default();
         let outcome = RunOutcome::read(run)?;
@@ -146,7 +146,7 @@ impl Run {
         let is_finished = all_steps && outcome_allows;
         Ok(Self {
             name,
-            environment: kind(&config),
+            environment: environment_label(&config),
             algorithm: config.algorithm.name(),
             seed: config.run.seed,
             mode: config.run.mode,
@@ -175,7 +175,7 @@ impl Run {
                 .and_then(|it| it.of(SavedPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
             exploration: Curve::of_episodes(&explored, limits.points),
-            learner: Rates::of(learner, limits.points),
+            learner: LearnerCurves::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
             hosts: JoinedHost::all(&read_hosts(&run.hosts())?),
             start: StartRecord::read(run.path())?,
@@ -254,7 +254,7 @@ impl Curve {
     }
 }
 
-impl Rates {
+impl LearnerCurves {
     fn of(mut rows: Vec<LearnerRecord>, points: usize) -> Self {
         let is_too_short = |i: &usize| rows[*i].wall_seconds - rows[i - 1].wall_seconds < SPAN;
         let too_short: Vec<usize> = (1..rows.len()).filter(is_too_short).collect();
@@ -333,7 +333,7 @@ fn configuration(run: &RunDir) -> anyhow::Result<Config> {
 }
 
 /// The environment's name and its textual parameters: returns of different rewards cannot be compared.
-fn kind(config: &Config) -> String {
+fn environment_label(config: &Config) -> String {
     let environment = &config.environment;
     let words = environment.parameters.values().filter_map(toml::Value::as_str);
     [environment.name.as_str()]
@@ -371,7 +371,7 @@ mod tests {
                 (row.env_steps_per_second, row.updates_per_second) = (Some(500.0), Some(500.0));
                 row
             };
-            Rates::of(times.map(row).into(), 10)
+            LearnerCurves::of(times.map(row).into(), 10)
         };
         let complete = rates(2.5);
         assert_eq!(

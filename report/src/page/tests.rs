@@ -124,7 +124,7 @@ fn a_run_has_finished_although_the_last_report_of_its_learner_was_lost() {
          1.0,{},3,1,1,,,,,,\n",
         steps - 1
     );
-    std::fs::write(run.learner_log(), learner).unwrap();
+    std::fs::write(run.learner_records(), learner).unwrap();
     for (state, shown) in [(RunState::Finished, "finished"), (RunState::Failed, "unfinished")] {
         let outcome = RunOutcome::new(state, steps, 4);
         outcome.with_reason("the reason".to_owned()).write(&run).unwrap();
@@ -182,7 +182,7 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
         incidents += &format!("{i}.5,{},actor,{},killed,killed by signal 9\n", i * 1_000, i % 4);
     }
     std::fs::write(run.evaluations(), evaluations).unwrap();
-    std::fs::write(run.learner_log(), learner).unwrap();
+    std::fs::write(run.learner_records(), learner).unwrap();
     std::fs::write(run.incidents(), incidents).unwrap();
     let page = gather(&[run], None).unwrap().page().unwrap();
     assert!(page.len() < 1_000_000, "{} bytes", page.len());

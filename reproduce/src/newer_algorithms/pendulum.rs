@@ -59,7 +59,7 @@ impl Family for PendulumAlgorithms {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
         let best = SwingUp::run(&mut Rollout::new(&policies.config, &policies.best.parameters)?)?;
         Ok(Tests { best: best.measures() })
     }

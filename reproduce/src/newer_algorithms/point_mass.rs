@@ -79,7 +79,7 @@ impl Family for PointMassAlgorithms {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let test_runs = TestRun::from_starts(&mut Rollout::new(&policies.config, &policies.best.parameters)?, &starts)?;
         Ok(Tests {

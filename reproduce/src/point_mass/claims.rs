@@ -9,13 +9,13 @@ use super::Tests;
 type Seed = SeedResult<Tests>;
 
 /// A measure of one test run.
-type Number = fn(&Measures) -> f64;
+type Measure = fn(&Measures) -> f64;
 
-const DISTANCE: Number = |it| it.final_distance;
-const TURNING: Number = |it| it.turning;
-const TURNING_AT_REST: Number = |it| it.turning_at_rest;
-const FORCE_AT_REST: Number = |it| it.force_at_rest;
-const FORCE_ON_THE_WAY: Number = |it| it.force_on_the_way;
+const DISTANCE: Measure = |it| it.final_distance;
+const TURNING: Measure = |it| it.turning;
+const TURNING_AT_REST: Measure = |it| it.turning_at_rest;
+const FORCE_AT_REST: Measure = |it| it.force_at_rest;
+const FORCE_ON_THE_WAY: Measure = |it| it.force_on_the_way;
 
 /// The test runs from the starts of section 5.3.
 fn near(measures: &[Measures]) -> &[Measures] {
@@ -27,28 +27,28 @@ fn far(measures: &[Measures]) -> &[Measures] {
     &measures[NEAR_STARTS.len().min(measures.len())..]
 }
 
-fn mean(measures: &[Measures], number: Number) -> f64 {
-    measures.iter().map(number).sum::<f64>() / measures.len() as f64
+fn mean(measures: &[Measures], measure: Measure) -> f64 {
+    measures.iter().map(measure).sum::<f64>() / measures.len() as f64
 }
 
-fn greatest(measures: &[Measures], number: Number) -> f64 {
-    measures.iter().map(number).fold(0.0, f64::max)
+fn greatest(measures: &[Measures], measure: Measure) -> f64 {
+    measures.iter().map(measure).fold(0.0, f64::max)
 }
 
 /// The best policy's mean over the starts of section 5.3.
-fn near_mean(seed: &Seed, number: Number) -> f64 {
-    mean(near(&seed.tests.best), number)
+fn near_mean(seed: &Seed, measure: Measure) -> f64 {
+    mean(near(&seed.tests.best), measure)
 }
 
 /// The spread over the seeds of the best policy's and the last policy's means over the starts of section 5.3.
-fn both(seeds: &[Seed], number: Number, decimals: usize, unit: &str) -> String {
+fn best_and_last(seeds: &[Seed], measure: Measure, decimals: usize, unit: &str) -> String {
     if seeds.is_empty() {
         return "no results".into();
     }
     format!(
         "{} {unit} (last policy {} {unit})",
-        spread(seeds.iter().map(|seed| near_mean(seed, number)), decimals),
-        spread(seeds.iter().map(|seed| mean(near(&seed.tests.last), number)), decimals)
+        spread(seeds.iter().map(|seed| near_mean(seed, measure)), decimals),
+        spread(seeds.iter().map(|seed| mean(near(&seed.tests.last), measure)), decimals)
     )
 }
 
@@ -75,7 +75,7 @@ fn pairs<'a>(a: &'a [Seed], b: &'a [Seed]) -> impl Iterator<Item = (&'a Seed, &'
 }
 
 /// The distances to the goal in the final evaluation.
-fn reached(seeds: &[Seed]) -> String {
+fn final_distances_text(seeds: &[Seed]) -> String {
     let shares = seeds.iter().filter_map(|seed| seed.best.evaluation.reached_fraction);
     let distances = seeds.iter().filter_map(|seed| seed.best.evaluation.final_distance_mean);
     format!(
@@ -85,7 +85,7 @@ fn reached(seeds: &[Seed]) -> String {
     )
 }
 
-fn arrives(seeds: &[Seed], thesis: &'static str) -> Claim {
+fn arrival_claim(seeds: &[Seed], thesis: &'static str) -> Claim {
     let farthest = |seed: &Seed| greatest(near(&seed.tests.best), DISTANCE);
     claim(
         thesis,
@@ -93,7 +93,7 @@ fn arrives(seeds: &[Seed], thesis: &'static str) -> Claim {
         format!(
             "largest of the four distances at the end: {} m; {}",
             spread(seeds.iter().map(farthest), 3),
-            reached(seeds)
+            final_distances_text(seeds)
         ),
         seeds,
         |seed| farthest(seed) < REACHED,
@@ -102,21 +102,21 @@ fn arrives(seeds: &[Seed], thesis: &'static str) -> Claim {
 
 pub(super) fn of_r1(seeds: &[Seed]) -> Vec<Claim> {
     vec![
-        arrives(
+        arrival_claim(
             seeds,
             "The vehicle learns to move from its start position to the goal; the position error converges to zero",
         ),
         claim(
             "Once the vehicle has stopped at the goal, the applied force does not go to zero",
             "the mean force at rest is above 0.1 N (its range is 0 to 2)",
-            format!("force at rest {}", both(seeds, FORCE_AT_REST, 3, "N")),
+            format!("force at rest {}", best_and_last(seeds, FORCE_AT_REST, 3, "N")),
             seeds,
             |seed| near_mean(seed, FORCE_AT_REST) > 0.1,
         ),
         claim(
             "… and the direction is shaky",
             "at rest the direction changes by more than 0.1 rad a step (5 rad in 50 steps)",
-            format!("turning at rest {}", both(seeds, TURNING_AT_REST, 1, "rad")),
+            format!("turning at rest {}", best_and_last(seeds, TURNING_AT_REST, 1, "rad")),
             seeds,
             |seed| near_mean(seed, TURNING_AT_REST) > 5.0,
         ),
@@ -132,7 +132,7 @@ fn converged_by(seed: &Seed) -> Option<u64> {
 }
 
 pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
-    let steady: Number = |it| it.drift_at_rest;
+    let steady: Measure = |it| it.drift_at_rest;
     let converged = |seeds: &[Seed]| {
         let steps = seeds.iter().filter_map(converged_by);
         let never = seeds.iter().filter(|seed| converged_by(seed).is_none()).count();
@@ -161,7 +161,7 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
         claim(
             "F_u approaches a steady value close to zero",
             "the mean force at rest is below 0.2 N, a tenth of its range",
-            format!("force at rest {}", both(r2, FORCE_AT_REST, 3, "N")),
+            format!("force at rest {}", best_and_last(r2, FORCE_AT_REST, 3, "N")),
             r2,
             |seed| near_mean(seed, FORCE_AT_REST) < 0.2,
         ),
@@ -171,9 +171,9 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
              0.5 m",
             format!(
                 "distance at the end {}; change at rest {}; {}",
-                both(r2, DISTANCE, 3, "m"),
-                both(r2, steady, 3, "m"),
-                reached(r2)
+                best_and_last(r2, DISTANCE, 3, "m"),
+                best_and_last(r2, steady, 3, "m"),
+                final_distances_text(r2)
             ),
             r2,
             |seed| near_mean(seed, steady) < 0.01 && (0.005..0.5).contains(&near_mean(seed, DISTANCE)),
@@ -193,11 +193,11 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
     });
     let least_arrived = least_arrived.fold(1.0, f64::min);
     vec![
-        arrives(r3, "The position error converges to zero"),
+        arrival_claim(r3, "The position error converges to zero"),
         claim(
             "F_u becomes zero when the vehicle is stopping",
             "the mean force at rest is below 0.1 N (its range is 0 to 2)",
-            format!("force at rest {}", both(r3, FORCE_AT_REST, 3, "N")),
+            format!("force at rest {}", best_and_last(r3, FORCE_AT_REST, 3, "N")),
             r3,
             |seed| near_mean(seed, FORCE_AT_REST) < 0.1,
         ),
@@ -206,9 +206,9 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
             criterion: "the mean force until the goal is reached is smaller than with r1 and with r2 for the same seed",
             ours: format!(
                 "force on the way with r3: {}; with r1: {}; with r2: {}",
-                both(r3, FORCE_ON_THE_WAY, 2, "N"),
-                both(r1, FORCE_ON_THE_WAY, 2, "N"),
-                both(r2, FORCE_ON_THE_WAY, 2, "N")
+                best_and_last(r3, FORCE_ON_THE_WAY, 2, "N"),
+                best_and_last(r1, FORCE_ON_THE_WAY, 2, "N"),
+                best_and_last(r2, FORCE_ON_THE_WAY, 2, "N")
             ),
             scope: Scope::EachSeed,
             held: less_than(r1)
@@ -278,20 +278,20 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
 
 /// `before` are the results at the end of the first training, `after` those at the end of the additional training.
 pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
-    let value = |before: &Seed, after: &Seed, number: Number| {
-        (near_mean(before, number), mean(near(&after.tests.last), number))
+    let value = |before: &Seed, after: &Seed, measure: Measure| {
+        (near_mean(before, measure), mean(near(&after.tests.last), measure))
     };
-    let check = |thesis, criterion, what: &str, number: Number, decimals, holds: fn(f64, f64) -> bool| Claim {
+    let check = |thesis, criterion, what: &str, measure: Measure, decimals, holds: fn(f64, f64) -> bool| Claim {
         thesis,
         criterion,
         ours: format!(
             "{what}: best policy of the first training {}; last policy of the additional training {}",
-            spread(pairs(before, after).map(|(b, a)| value(b, a, number).0), decimals),
-            spread(pairs(before, after).map(|(b, a)| value(b, a, number).1), decimals)
+            spread(pairs(before, after).map(|(b, a)| value(b, a, measure).0), decimals),
+            spread(pairs(before, after).map(|(b, a)| value(b, a, measure).1), decimals)
         ),
         scope: Scope::EachSeed,
         held: pairs(before, after)
-            .map(|(b, a)| value(b, a, number))
+            .map(|(b, a)| value(b, a, measure))
             .map(|(b, a)| holds(b, a))
             .collect(),
     };

@@ -48,11 +48,11 @@ impl ChildProcess {
             index: 0,
             incarnation: 1,
         };
-        Self::member(first, run)
+        Self::of_instance(first, run)
     }
 
     /// Starts this program again as a role of the run.
-    pub fn member(instance: RoleInstance, run: &RunDir) -> anyhow::Result<Self> {
+    pub fn of_instance(instance: RoleInstance, run: &RunDir) -> anyhow::Result<Self> {
         let name = instance.role.name();
         let mut command = role_command(instance, run.path());
         Self::start(&mut command, name.into()).with_context(|| format!("cannot start the {name}"))

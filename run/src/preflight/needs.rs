@@ -84,7 +84,7 @@ mod tests {
         const RESERVED: u64 = 1 << 20;
         let config = resolve_preset("pendulum").unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let run = RunDir::planned(directory.path());
+        let run = RunDir::at(directory.path());
         let before = disk(&config, &run).unwrap();
         let unfinished = File::create(directory.path().join("replay.bin.new")).unwrap();
         assert_eq!(disk(&config, &run).unwrap(), before, "nothing is reserved yet");

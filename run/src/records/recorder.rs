@@ -149,14 +149,14 @@ impl Recorder {
     pub fn open(run: &RunDir, ratio: &ReplayConfig) -> Result<Self, RecordError> {
         let episodes = Table::open::<EpisodeRecord>(&run.episodes())?;
         let evaluations = Table::open::<EvaluationRecord>(&run.evaluations())?;
-        let learner = Table::open::<LearnerRecord>(&run.learner_log())?;
+        let learner = Table::open::<LearnerRecord>(&run.learner_records())?;
         let incidents = Table::open::<IncidentRow>(&run.incidents())?;
         change::create(run)?;
         let evaluated = read_evaluations(&run.evaluations())?
             .iter()
             .map(|row| row.env_steps)
             .max();
-        let learned = read_learner(&run.learner_log())?;
+        let learned = read_learner(&run.learner_records())?;
         let earlier = learned.last().map_or(0.0, |row| row.wall_seconds);
         // Not the last rows: in records of earlier versions the steps may have fallen.
         let env_steps = learned.iter().map(|row| row.env_steps).max().unwrap_or(0);
@@ -379,7 +379,7 @@ pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordErr
 
 /// Environment steps and episodes of a run, by the last row of its `learner.csv`; `None` before the first row.
 pub fn recorded(run: &RunDir) -> Result<Option<(u64, u64)>, RecordError> {
-    Ok(table::last::<LearnerRecord>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
+    Ok(table::last::<LearnerRecord>(&run.learner_records())?.map(|row| (row.env_steps, row.episodes)))
 }
 
 #[cfg(test)]

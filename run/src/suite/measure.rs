@@ -17,7 +17,7 @@ pub fn share_done(run: &Path) -> f64 {
         let run = RunDir::open(run).ok()?;
         let limits = run.config().ok()?.run;
         let origin = Origin::read(&run).ok()?;
-        if limits.begins_with_others() && origin.is_none() {
+        if limits.has_origin() && origin.is_none() {
             // They are being copied.
             return Some((0, limits.steps));
         }
@@ -29,7 +29,7 @@ pub fn share_done(run: &Path) -> f64 {
             .is_none()
             .then_some((without(rows), without(limits.steps)))
     };
-    let progress = of_steps().or_else(|| distance(run));
+    let progress = of_steps().or_else(|| progress(run));
     progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
 }
 
@@ -58,8 +58,8 @@ fn returns(run: &Path) -> impl Iterator<Item = f64> {
     learned.map(|evaluation| evaluation.return_mean)
 }
 
-/// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
-pub fn distance(run: &Path) -> Option<(u64, u64)> {
+/// What a run has done, and what it is to do: episodes if they limit it, otherwise environment steps.
+pub fn progress(run: &Path) -> Option<(u64, u64)> {
     let run = RunDir::open(run).ok()?;
     let config: Config = run.config().ok()?;
     let (steps, episodes) = recorded(&run).ok()?.unwrap_or_default();

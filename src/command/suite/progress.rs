@@ -9,7 +9,7 @@ use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_common::message::say;
 use shoal_run::numbers::thousands;
 use shoal_run::suite::Suite;
-use shoal_run::suite::measure::{best_return, distance, final_return};
+use shoal_run::suite::measure::{self, best_return, final_return};
 use shoal_run::suite::schedule::{Event, Observer};
 
 /// Prints how the training of a suite goes.
@@ -92,8 +92,8 @@ struct RunLength {
     /// Made since this process began.
     made: u64,
     left: u64,
-    /// Of the whole run; 0 if nobody knows.
-    goal: u64,
+    /// Of the whole run; `None` if nobody knows yet.
+    goal: Option<u64>,
 }
 
 impl TrainingProgress {
@@ -112,7 +112,7 @@ impl TrainingProgress {
             bar.set_style(style.progress_chars("━━─"));
         }
         let due_run = |number: &usize| {
-            let begin = distance(&runs[*number]).map_or(0, |(done, _)| done);
+            let begin = measure::progress(&runs[*number]).map_or(0, |(done, _)| done);
             (*number, DueRun { begin, ended: false })
         };
         Self {
@@ -181,11 +181,11 @@ impl TrainingProgress {
 
     fn time_left(&self) -> Option<String> {
         let length = |(number, run): (&usize, &DueRun)| {
-            let Some((done, all)) = distance(&self.runs[*number]) else {
+            let Some((done, all)) = measure::progress(&self.runs[*number]) else {
                 let nothing = RunLength {
                     made: 0,
                     left: 0,
-                    goal: 0,
+                    goal: None,
                 };
                 return run.ended.then_some(nothing);
             };
@@ -193,7 +193,7 @@ impl TrainingProgress {
             Some(RunLength {
                 made: done.saturating_sub(run.begin),
                 left: if run.ended { 0 } else { goal.saturating_sub(done) },
-                goal,
+                goal: Some(goal),
             })
         };
         let lengths: Vec<_> = self.due.iter().map(length).collect();
@@ -210,7 +210,7 @@ impl TrainingProgress {
             lines[0] += &format!(" · {left} left");
         }
         for number in &self.running {
-            if let Some((done, all)) = distance(&self.runs[*number]) {
+            if let Some((done, all)) = measure::progress(&self.runs[*number]) {
                 let name: String = self.names[*number].chars().take(50).collect();
                 lines.push(format!("{name}: {} of {}", thousands(done), thousands(all)));
             }
@@ -233,7 +233,7 @@ fn seconds_left(runs: &[Option<RunLength>], elapsed: Duration) -> Option<f64> {
     let made: u64 = begun().map(|run| run.made).sum();
     let left: u64 = begun().map(|run| run.left).sum();
     let waiting = runs.len() - begun().count();
-    let goals: Vec<u64> = begun().map(|run| run.goal).filter(|goal| *goal > 0).collect();
+    let goals: Vec<u64> = begun().filter_map(|run| run.goal).collect();
     let mean_goal = goals.iter().sum::<u64>() as f64 / goals.len().max(1) as f64;
     let left = left as f64 + waiting as f64 * mean_goal;
     (made > 0 && left > 0.0).then(|| elapsed.as_secs_f64() * left / made as f64)
@@ -245,7 +245,10 @@ mod tests {
 
     #[test]
     fn the_remaining_time_counts_what_each_run_has_left() {
-        let run = |made, left, goal| Some(RunLength { made, left, goal });
+        let run = |made, left, goal| {
+            let goal = (goal > 0).then_some(goal);
+            Some(RunLength { made, left, goal })
+        };
         let seconds = |runs: &[Option<RunLength>]| seconds_left(runs, Duration::from_secs(10));
         assert_eq!(seconds(&[run(100, 300, 400)]), Some(30.0));
         assert_eq!(seconds(&[run(100, 300, 900)]), Some(30.0), "a resumed run");

@@ -7,7 +7,6 @@ use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, Ho
 use shoal_common::role::Role;
 
 use super::Supervisor;
-use crate::launcher::joined_hosts::INCARNATIONS;
 
 impl Supervisor {
     /// Gives actors and incarnations to another host. One that an earlier launcher has given actors gets them again, if
@@ -56,7 +55,7 @@ impl Supervisor {
             )));
         };
         actors.sort_unstable();
-        let first_incarnation = self.take_incarnations(INCARNATIONS)?;
+        let first_incarnation = self.take_incarnations(HostLease::INCARNATIONS)?;
         // The learner opens those of all actors up to the last one.
         let last = actors.iter().max().copied();
         self.create_transitions(domain, last.map_or(0..0, |last| 0..last + 1))?;
@@ -68,7 +67,7 @@ impl Supervisor {
             epoch: self.joined_hosts.epoch(),
             actors,
             first_incarnation,
-            limit: first_incarnation + INCARNATIONS,
+            limit: first_incarnation + HostLease::INCARNATIONS,
         };
         self.joined_hosts.admit(lease.clone());
         self.share_lockstep_actors();

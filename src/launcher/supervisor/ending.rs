@@ -6,7 +6,7 @@ use shoal_run::records::recorder::{Incident, IncidentKind};
 
 use super::Supervisor;
 use crate::launcher::log::ALL_ENDED;
-use crate::launcher::process::{ending, name};
+use crate::launcher::process::{describe_exit, name};
 
 impl Supervisor {
     /// Asks the processes of a role to hand over what they have and then to end.
@@ -45,7 +45,7 @@ impl Supervisor {
                     (child.process, child.ended) = (None, Some(status));
                     if child.instance.role == Role::Learner {
                         self.learner_done = status.success();
-                        self.unsaved_learner = (!status.success()).then(|| ending(status));
+                        self.unsaved_learner = (!status.success()).then(|| describe_exit(status));
                     }
                 }
                 None => all = false,

@@ -53,8 +53,8 @@ impl Supervisor {
             return Ok(());
         }
         bail!(
-            "the environments returned something invalid {count} times, and environment.faults is {most}; the last time: \
-             {last}"
+            "the environments returned something invalid {count} times, and environment.faults is {most}: correct the \
+             environment, or raise environment.faults; the last time: {last}"
         );
     }
 }

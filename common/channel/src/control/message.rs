@@ -66,6 +66,14 @@ pub struct HostLease {
     pub limit: u64,
 }
 
+/// Why a launcher admits no host and changes nothing once it has begun to end the run.
+pub const RUN_IS_ENDING: &str = "the run is ending";
+
+impl HostLease {
+    /// Incarnations that a host gets at once: more than it will ever need.
+    pub const INCARNATIONS: u64 = 1 << 20;
+}
+
 /// The state of another host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

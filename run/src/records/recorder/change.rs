@@ -40,7 +40,7 @@ impl Moment {
     /// # Errors
     /// When they cannot be read.
     pub fn of_records(run: &RunDir) -> Result<Self, RecordError> {
-        let learned: Vec<LearnerRecord> = read_learner(&run.learner_log())?;
+        let learned: Vec<LearnerRecord> = read_learner(&run.learner_records())?;
         Ok(Self {
             wall_seconds: learned.last().map_or(0.0, |row| row.wall_seconds),
             env_steps: learned.iter().map(|row| row.env_steps).max().unwrap_or(0),

@@ -85,7 +85,7 @@ fn every_report_becomes_a_row() {
          1.0,2000,1000,9,-1500.25,90.0,10,1\n"
     );
     assert_eq!(
-        text(&run.learner_log()),
+        text(&run.learner_records()),
         "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
          env_steps_per_second,ratio\n\
          1.5,1000,0,0,0,,,,,,\n\
@@ -179,7 +179,7 @@ fn a_learner_that_fell_back_to_a_checkpoint_has_no_update_rate() {
     let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
     recorder.learner(&learner(2_500, 400, 1), seconds(2.0)).unwrap();
-    let rows: Vec<LearnerRecord> = table::rows(&run.learner_log()).unwrap();
+    let rows: Vec<LearnerRecord> = table::rows(&run.learner_records()).unwrap();
     assert_eq!(
         (rows[1].updates_per_second, rows[1].env_steps_per_second),
         (None, Some(500.0))
@@ -204,7 +204,7 @@ fn recorded_steps_never_fall_after_a_learners_restart_or_a_resume() {
         recorder.episode(&episode(steps), seconds(1.0)).unwrap();
     }
     drop(recorder);
-    let learned = read_learner(&run.learner_log()).unwrap();
+    let learned = read_learner(&run.learner_records()).unwrap();
     let learned: Vec<u64> = learned.iter().map(|row| row.env_steps).collect();
     assert_eq!(learned, [1_000, 2_000, 2_000, 2_300, 2_600]);
     let explored = read_episodes(&run.episodes()).unwrap();
@@ -227,7 +227,7 @@ fn every_table_has_its_header_from_the_start() {
         assert_eq!(text(&run.incidents()), header);
         drop(recorder);
     }
-    for table in [run.episodes(), run.evaluations(), run.learner_log()] {
+    for table in [run.episodes(), run.evaluations(), run.learner_records()] {
         assert_eq!(text(&table).lines().count(), 1);
     }
     assert_eq!(read_incidents(&run.incidents()).unwrap(), Some(Vec::new()));
