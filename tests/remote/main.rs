@@ -424,6 +424,9 @@ fn a_gate_that_cannot_be_started_at_the_end_does_not_keep_the_learner_from_savin
     assert_eq!(running.wait().0, Some(1), "{}", place.stderr());
     assert!(place.stderr().contains("incarnations"), "{}", place.stderr());
     assert_eq!(in_replay(&path, &[0]), sent(&path, 0));
+    let saved = place.output(&["status", "run", "--json"]);
+    let saved = support::parse(&String::from_utf8(saved.stdout).unwrap());
+    assert_eq!(saved["env_steps"], in_replay(&path, &[0, 1]), "the learner has saved");
 }
 
 #[test]
