@@ -271,7 +271,9 @@ impl Supervisor {
         self.cleaning.clean(domain, &self.services, &self.log);
         self.children[i].restarts += 1;
         self.start(i)?;
-        self.unsaved_learner = None;
+        if role == Role::Learner {
+            self.unsaved_learner = None;
+        }
         self.note_incident(i, IncidentKind::StartedAgain, String::new());
         Ok(true)
     }
