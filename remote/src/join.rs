@@ -102,7 +102,10 @@ impl LeaseKeeper {
                 send(number, false);
                 match ended.recv_timeout(REPORT_INTERVAL) {
                     // So that the gate need not wait for this host.
-                    Err(RecvTimeoutError::Timeout) if is_over.load(Ordering::Relaxed) => send(number + 1, true),
+                    Err(RecvTimeoutError::Timeout) if is_over.load(Ordering::Relaxed) => {
+                        send(number + 1, true);
+                        break;
+                    }
                     Err(RecvTimeoutError::Timeout) => {}
                     Ok(false) | Err(RecvTimeoutError::Disconnected) => break,
                     Ok(true) => {
