@@ -121,6 +121,13 @@ pub(crate) fn run(
 /// # Errors
 /// When some do not end. That is recorded as the run's outcome.
 pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Result<()> {
+    if Domain::wait_for_earlier_processes(run_id, Duration::ZERO).is_ok() {
+        return Ok(());
+    }
+    if let Some(outcome) = RunOutcome::read(run)?.filter(|outcome| outcome.state == RunState::Running) {
+        // For `shoal status`, which nobody answers until there is a launcher.
+        outcome.with_reason(OutcomeReason::Starting).write(run)?;
+    }
     let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END);
     waited
         .map_err(|error| name_original_run(error, run))
