@@ -310,8 +310,8 @@ impl<'a> Gate<'a> {
             if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
                 host.warned_at = Some(Instant::now());
                 tracing::warn!(
-                    "host {} sent an invalid chunk of actor {} (wrong shape, a number that is not finite, or an earlier lease); it is \
-                     ignored",
+                    "host {} sent an invalid chunk of actor {} (of another shape, with a number that is not finite, or by an \
+                     earlier lease); it is ignored",
                     host.lease.name,
                     chunk.header.actor
                 );

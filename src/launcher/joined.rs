@@ -109,8 +109,8 @@ impl<'a> JoinedLauncher<'a> {
     }
 
     fn run(mut self, give_up: Duration, on_relay_ready: Box<dyn FnOnce()>) -> anyhow::Result<JoinEnd> {
-        // Kept until the end of this function: dropping it gives the host's actors back, and a relay that starts meanwhile
-        // still needs them.
+        // Kept until the end of this function: dropping it gives the host's actors back, and a relay that starts
+        // meanwhile still needs them.
         let mut on_relay_ready = Some(on_relay_ready);
         let ending = self.watch(give_up, &mut on_relay_ready);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they

@@ -199,8 +199,8 @@ impl Supervisor {
         std::mem::take(&mut self.incidents)
     }
 
-    /// Makes sure that no later launcher uses the next `count` incarnations. Doing so for several processes at once saves
-    /// time: on a slow disk, each writing takes up to a second.
+    /// Makes sure that no later launcher uses the next `count` incarnations. Doing so for several processes at once
+    /// saves time: on a slow disk, each writing takes up to a second.
     fn reserve_incarnations(&mut self, count: u64) -> anyhow::Result<()> {
         let needed = self.processes_started + count;
         if needed > self.reserved {
