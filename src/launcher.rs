@@ -473,12 +473,13 @@ impl<'a> Launcher<'a> {
     /// that.
     fn tell_hosts(&mut self, receiver: Option<Role>) -> anyhow::Result<()> {
         let deadline = Instant::now() + GATE_END;
+        self.supervisor.ensure_gate(self.domain)?;
         loop {
-            self.supervisor.ensure_gate(self.domain)?;
             self.supervisor.ask_to_retire(Role::Gate);
             let left = deadline.saturating_duration_since(Instant::now());
             self.await_end(|role| role == Role::Gate, left, receiver);
-            if !self.supervisor.has_failed(Role::Gate) || Instant::now() >= deadline {
+            let may_try_again = self.supervisor.has_failed(Role::Gate) && Instant::now() < deadline;
+            if !(may_try_again && self.supervisor.ensure_gate(self.domain)?) {
                 return Ok(());
             }
         }

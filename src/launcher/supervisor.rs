@@ -235,15 +235,12 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Starts the gate again if it has just died and other hosts are waiting for news.
+    /// Starts the gate again if it has just died and other hosts are waiting for news. Returns whether it was started.
     ///
     /// # Errors
     /// When it cannot be started.
-    pub(super) fn ensure_gate(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        if !self.joined_hosts.leases().is_empty() {
-            self.restart_if_dead(Role::Gate, domain)?;
-        }
-        Ok(())
+    pub(super) fn ensure_gate(&mut self, domain: &Domain) -> anyhow::Result<bool> {
+        Ok(!self.joined_hosts.leases().is_empty() && self.restart_if_dead(Role::Gate, domain)?)
     }
 
     /// Restarts the only process of a role if it has died; a learner only if it had not finished. Returns whether it was
