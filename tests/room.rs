@@ -18,7 +18,7 @@ use std::sync::OnceLock;
 
 use rustix::process::{Pid, Signal, kill_process};
 use suite::{Need, ROOT, test};
-use support::{Leftovers, QUICK, Running, Workplace, error_line, json, until};
+use support::{Leftovers, QUICK, Running, Workplace, committed, error_line, json, until};
 
 const SHOAL: &str = env!("CARGO_BIN_EXE_shoal");
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
@@ -140,6 +140,10 @@ fn a_run_reserves_at_most_the_computed_memory_and_at_least_half_of_it() {
         let place = Workplace::new();
         let running = place.start_as("run", &[&QUICK[..], &ENDLESS, arguments].concat());
         // A role opens its last channels after it has reported that it is ready.
+        let actors: usize = arguments[1].parse().unwrap();
+        until("the learner has rows of every actor", || {
+            (0..actors).all(|actor| committed(&running.run, actor) > 0)
+        });
         until("something is learned", || running.learned("updates") > 0);
         let files = files_of(&running);
         let promised = |path: &PathBuf| path.to_str()?.split_once("_promise_")?.1.parse().ok();
