@@ -14,13 +14,14 @@ mod log;
 mod process;
 mod progress;
 mod requests;
+mod shares;
 mod stall;
 mod supervisor;
 
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RUN_IS_ENDING, RunStatus};
+use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::{Config, Mode};
@@ -550,16 +551,14 @@ impl EndRoles for Launcher<'_> {
                             Err(error) => ControlResponse::Refused(error.to_string()),
                         },
                     )),
-                    ControlRequest::Scale { .. } if *is_ending => {
-                        Ok(Some(ControlResponse::Refused(RUN_IS_ENDING.into())))
-                    }
-                    ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
+                    ControlRequest::Scale(_) if *is_ending => Ok(Some(ControlResponse::RunIsEnding)),
+                    ControlRequest::Scale(request) => requests::scale(config, run, supervisor, &request, now).map(Some),
                     ControlRequest::Admit(_) if *is_ending || end_request.is_some() => {
-                        Ok(Some(ControlResponse::Refused(RUN_IS_ENDING.into())))
+                        Ok(Some(ControlResponse::RunIsEnding))
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
                     ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
-                    ControlRequest::Replace { .. } | ControlRequest::JoinAgain => {
+                    ControlRequest::Replace { .. } | ControlRequest::JoinAgain(_) => {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
                     }
                     ControlRequest::Stop => {

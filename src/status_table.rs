@@ -48,11 +48,16 @@ pub(crate) fn host_cells(host: &HostStatus) -> [String; 7] {
         HostState::CutOff => format!("cut off for {:.0} s", host.silent_seconds),
         HostState::Left => "has left".into(),
     };
+    let actors = if host.wanted_actors == host.actors {
+        host.actors.to_string()
+    } else {
+        format!("{} to {}", host.actors, host.wanted_actors)
+    };
     let round_trip = host.round_trip_us;
     [
         host.name.clone(),
         state,
-        host.actors.to_string(),
+        actors,
         format!("{:.0}/s", host.rows_per_second),
         thousands(host.resent_chunks),
         round_trip.map_or_else(String::new, |time| format!("{:.1} ms", time as f64 / 1e3)),

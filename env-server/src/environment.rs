@@ -11,10 +11,11 @@ pub mod point_mass;
 mod signal;
 
 pub use drawing::{Class, Drawing, Form, Point, Shape};
-pub use error::{EnvironmentError, OutOfRange, RequestError};
+pub use error::{EnvironmentError, RequestError, check, check_time_limit};
 pub use interface::{Environment, Step};
 use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
+pub use shoal_base::section::OutOfRange;
 use shoal_base::section::{self, Key};
 pub use signal::{Goal, Picture, Signal, SignalSource};
 
@@ -187,7 +188,7 @@ mod tests {
         );
         assert_eq!(
             refusal("point-mass", "friction = -0.5"),
-            "environment point-mass: `friction` is -0.5: give a number from 0 to 1"
+            "environment point-mass: friction = -0.5: must be from 0 to 1"
         );
         for (name, text) in [
             ("pendulum", "start_speed = nan"),
@@ -196,7 +197,7 @@ mod tests {
             ("point-mass", "mass = 0.0"),
             ("frozen-lake", "time_limit = 0"),
         ] {
-            assert!(refusal(name, text).contains("give a number from"), "{name} {text}");
+            assert!(refusal(name, text).contains(": must be from "), "{name} {text}");
         }
     }
 }

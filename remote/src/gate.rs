@@ -381,6 +381,7 @@ impl<'a> Gate<'a> {
             host: hello.host,
             name: hello.name.clone(),
             actors: hello.actors,
+            cores: hello.cores,
             held: hello.held.clone(),
         };
         self.requests.ask(
@@ -434,6 +435,9 @@ impl<'a> Gate<'a> {
                     self.admit(lease)?;
                     answer_join(&query, &Admission::Admitted(answer))?;
                 }
+                (Ok(ControlResponse::RunIsEnding), PendingRequest::Join(query, _)) => {
+                    answer_join(&query, &Admission::RunIsEnding)?;
+                }
                 (answer, PendingRequest::Join(query, hello)) => {
                     let why = match answer {
                         Ok(ControlResponse::Refused(why)) | Err(why) => why,
@@ -459,8 +463,12 @@ impl<'a> Gate<'a> {
 
     /// Takes in a host, or what it has been given anew.
     fn admit(&mut self, lease: HostLease) -> Result<(), GateError> {
-        if self.hosts.get(&lease.host).is_some_and(|host| host.lease == lease) {
-            return Ok(());
+        if let Some(host) = self.hosts.get_mut(&lease.host) {
+            // Another number of actors is only announced: the host joins again for it.
+            host.lease.wanted_actors = lease.wanted_actors;
+            if host.lease == lease {
+                return Ok(());
+            }
         }
         let report = self.hosts.get(&lease.host).map_or(0, |host| host.last_report);
         self.release(lease.host);
@@ -575,6 +583,7 @@ impl<'a> Gate<'a> {
             let acknowledgement = Acknowledgement {
                 number: self.acknowledgements_sent,
                 report: host.last_report,
+                wanted_actors: host.lease.wanted_actors,
                 actors,
                 ..without_actors.clone()
             };
@@ -601,6 +610,7 @@ impl<'a> Gate<'a> {
             },
             rows: self.replay.rows(),
             report: 0,
+            wanted_actors: 0,
             actors: Vec::new(),
         })
     }

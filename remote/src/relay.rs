@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
-use shoal_common::channel::control::ControlRequest;
+use shoal_common::channel::control::{ControlRequest, JoinAgain};
 use shoal_common::channel::policy::PolicyPublisher;
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::transitions::ChunkReceiver;
@@ -29,10 +29,9 @@ use crate::join::ask_to_join;
 use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_INTERVAL, failed};
 use crate::requests::LauncherRequests;
 use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
-use crate::wire::vector_instructions;
 use crate::wire::{
     Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, RunPhase,
-    WireChunk, WireError, WirePolicy, id_of,
+    WireChunk, WireError, WirePolicy, cores, id_of, vector_instructions,
 };
 
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
@@ -174,6 +173,8 @@ struct Relay<'a> {
     is_refused: bool,
     /// When the launcher of this host was last told that its actors belong to others.
     lost_actors_at: Option<Instant>,
+    /// When it was last told that the run wants this host to have another number of actors.
+    scaled_at: Option<Instant>,
     /// When a request to stop was first seen.
     stop_seen_at: Option<Instant>,
 }
@@ -268,6 +269,7 @@ impl<'a> Relay<'a> {
             run_is_over: false,
             is_refused: false,
             lost_actors_at: None,
+            scaled_at: None,
             stop_seen_at: None,
         })
     }
@@ -387,6 +389,8 @@ impl<'a> Relay<'a> {
         }
         if lost {
             self.lose_actors();
+        } else if acknowledgement.wanted_actors != self.actors.len() as u32 {
+            self.scale(acknowledgement.wanted_actors);
         }
         if other_gate || !changed.is_empty() {
             let of_host = acknowledgement.actors.iter();
@@ -405,7 +409,19 @@ impl<'a> Relay<'a> {
         if self.lost_actors_at.is_none_or(|told| told.elapsed() >= REJOIN_INTERVAL) {
             tracing::warn!("the run has given the actors of this host to others");
             self.lost_actors_at = Some(Instant::now());
-            self.requests.ask(ControlRequest::JoinAgain, ());
+            let why = JoinAgain::LostActors;
+            self.requests.ask(ControlRequest::JoinAgain(why), ());
+        }
+    }
+
+    /// Tells the launcher of this host that the run wants it to have another number of actors, so that the host joins
+    /// again.
+    fn scale(&mut self, actors: u32) {
+        if self.scaled_at.is_none_or(|told| told.elapsed() >= REJOIN_INTERVAL) {
+            tracing::info!("the run wants this host to have {actors} actors");
+            self.scaled_at = Some(Instant::now());
+            let why = JoinAgain::Scaled(actors);
+            self.requests.ask(ControlRequest::JoinAgain(why), ());
         }
     }
 
@@ -429,6 +445,7 @@ impl<'a> Relay<'a> {
             name: host.name.clone(),
             instructions: vector_instructions(),
             actors: host.actors.len() as u32,
+            cores: cores(),
             held: host.actors.clone(),
         };
         let (session, wake, run_id) = (self.session.clone(), self.wake.clone(), host.run_id.clone());
@@ -457,6 +474,10 @@ impl<'a> Relay<'a> {
             Ok(Admission::Admitted(_)) => self.lose_actors(),
             Ok(Admission::Refused(why)) => {
                 tracing::warn!("not admitted again: {why}");
+                self.is_refused = true;
+            }
+            Ok(Admission::RunIsEnding) => {
+                tracing::warn!("not admitted again: the run is ending");
                 self.is_refused = true;
             }
             Err(why) => tracing::debug!("no answer: {why}"),

@@ -13,7 +13,7 @@ use shoal_common::report::{EpisodeReport, Heartbeat};
 use shoal_common::role::{Activity, Role, RoleInstance};
 
 /// The version of this format. Increase it with every change.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// The longest message, in bytes: far more than any policy or chunk has.
 pub const LONGEST: usize = 256 << 20;
@@ -185,6 +185,8 @@ pub struct Hello {
     pub instructions: String,
     /// The number of actors that it offers.
     pub actors: u32,
+    /// The number of its processor cores.
+    pub cores: u32,
     /// The actors that it has already, if it was admitted before.
     pub held: Vec<u32>,
 }
@@ -200,6 +202,11 @@ impl Hello {
         self.name.truncate(end.unwrap_or(0));
         self
     }
+}
+
+/// The number of processor cores of this host.
+pub fn cores() -> u32 {
+    std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32)
 }
 
 /// The vector instructions of this processor that the program may use.
@@ -229,6 +236,8 @@ pub enum Admission {
     Admitted(WireLease),
     /// It may not, for this reason.
     Refused(String),
+    /// It may not, because the run is ending.
+    RunIsEnding,
 }
 
 /// What a host is given.
@@ -270,6 +279,8 @@ pub struct Acknowledgement {
     pub rows: u64,
     /// The number of the last report that the gate has received from this host.
     pub report: u64,
+    /// The number of actors that the run wants this host to have.
+    pub wanted_actors: u32,
     /// For each actor of the host.
     pub actors: Vec<ActorAcknowledgement>,
 }

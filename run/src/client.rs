@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
-use shoal_common::channel::control::{self, ControlError, ControlRequest, ControlResponse, RunStatus};
+use anyhow::{anyhow, bail};
+use shoal_common::channel::control::{self, ControlError, ControlRequest, ControlResponse, RunStatus, ScaleRequest};
 use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
@@ -137,11 +137,12 @@ impl RunClient {
         }
     }
 
-    /// Changes the number of actors.
-    pub fn scale(&self, actors: u32) -> anyhow::Result<()> {
-        match self.ask(ControlRequest::Scale { actors }, SCALE_PATIENCE)? {
+    /// Changes the number of actors. Returns that of this host, which is the learner's, and that of all hosts together.
+    pub fn scale(&self, request: ScaleRequest) -> anyhow::Result<(u32, u32)> {
+        match self.ask(ControlRequest::Scale(request), SCALE_PATIENCE)? {
             None => bail!("{}", self.not_running()),
-            Some(answer) => accepted(answer),
+            Some(ControlResponse::Scaled { here, total }) => Ok((here, total)),
+            Some(answer) => Err(not_accepted(answer)),
         }
     }
 
@@ -196,7 +197,14 @@ pub fn is_in_final_evaluation(status: &RunStatus) -> bool {
 fn accepted(answer: ControlResponse) -> anyhow::Result<()> {
     match answer {
         ControlResponse::Accepted => Ok(()),
-        ControlResponse::Refused(reason) => bail!("{reason}"),
-        other => bail!("the launcher gave an unexpected answer: {other:?}"),
+        answer => Err(not_accepted(answer)),
+    }
+}
+
+fn not_accepted(answer: ControlResponse) -> anyhow::Error {
+    match answer {
+        ControlResponse::Refused(reason) => anyhow!(reason),
+        ControlResponse::RunIsEnding => anyhow!("the run is ending"),
+        other => anyhow!("the launcher gave an unexpected answer: {other:?}"),
     }
 }

@@ -98,17 +98,17 @@ mod with_network {
     use std::path::Path;
 
     use anyhow::{Context, bail};
-    use shoal_common::channel::control::RUN_IS_ENDING;
+    use shoal_common::channel::control::JoinAgain;
     use shoal_common::message::say;
     use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
     use shoal_remote::join::{GateConnection, JoinError, LeaseKeeper, join as ask};
     use shoal_remote::network::restart_with_one_thread;
-    use shoal_remote::wire::{Admission, Hello, WireLease, vector_instructions};
+    use shoal_remote::wire::{Admission, Hello, WireLease, cores, vector_instructions};
     use shoal_run::joining::make_host_directory;
     use shoal_run::records::outcome::{RunOutcome, RunState};
-    use shoal_run::signals::{Signals, exit_code};
+    use shoal_run::signals::{Interrupt, Signals, exit_code};
     use shoal_run::usage::UsageError;
 
     use super::*;
@@ -120,6 +120,12 @@ mod with_network {
     /// How the names of temporary directories begin; the host's number follows.
     const TEMPORARY_PREFIX: &str = "shoal-join-";
 
+    /// How the work of a host has ended.
+    enum HostEnd {
+        Exit(ExitCode),
+        JoinAgain(JoinAgain),
+    }
+
     /// This host, as the run knows it, and how it reaches the run.
     struct JoiningHost {
         number: u64,
@@ -129,24 +135,30 @@ mod with_network {
         key: Option<KeyFile>,
     }
 
-    /// Joins the run, and works for it until it is over. A host that has lost its actors joins again.
-    pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
+    /// Joins the run, and works for it until it is over. A host that has lost its actors, or that the run wants to have
+    /// another number of them, joins again.
+    pub(super) fn join(args: &JoinArgs, run: &str, mut actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
         let (endpoint, key) = endpoint(args, run)?;
         remove_abandoned(&std::env::temp_dir());
         let signals = Signals::register()?;
         let mut attempt = 1;
         loop {
-            let ended = join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, attempt)?;
-            if let Some(code) = ended {
-                return Ok(code);
+            match join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, attempt)? {
+                HostEnd::Exit(code) => return Ok(code),
+                HostEnd::JoinAgain(JoinAgain::LostActors) => {
+                    say("the run has given the actors of this host to others; joining again");
+                }
+                HostEnd::JoinAgain(JoinAgain::Scaled(wanted)) => {
+                    say(format!("the run wants {wanted} actors of this host; joining again"));
+                    actors = wanted;
+                }
             }
-            say("the run has given the actors of this host to others; joining again");
             attempt += 1;
         }
     }
 
-    /// Joins the run; `attempt` counts from 1. `None` if the host has lost its actors.
+    /// Joins the run; `attempt` counts from 1.
     fn join_once(
         args: &JoinArgs,
         run: &str,
@@ -154,7 +166,7 @@ mod with_network {
         (endpoint, key): (Endpoint, Option<KeyFile>),
         signals: &Signals,
         attempt: u32,
-    ) -> anyhow::Result<Option<ExitCode>> {
+    ) -> anyhow::Result<HostEnd> {
         let interrupt = signals.interrupt();
         let number = host_number()?;
         let name = match &args.name {
@@ -167,40 +179,13 @@ mod with_network {
             name: name.clone(),
             instructions: vector_instructions(),
             actors,
+            cores: cores(),
             held: Vec::new(),
         };
-        let ends = || interrupt.signal().is_some() || is_finished(run);
-        // When a host joins again, the run may not have got its former actors back yet.
-        let said = Cell::new(false);
-        let ask_again = |why: &str| {
-            let again = attempt > 1 && why != RUN_IS_ENDING;
-            if again && !said.replace(true) {
-                say(format!("{endpoint} does not admit this host yet: {why}"));
-            }
-            again
-        };
-        let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends, ask_again);
-        let (lease, connection) = match (admission, interrupt.signal()) {
-            (Ok((Admission::Admitted(lease), connection)), _) => (lease, connection),
-            (_, Some(signal)) => return Ok(Some(exit_code(signal))),
-            (Ok((Admission::Refused(why), _)), None) if attempt > 1 && (why == RUN_IS_ENDING || is_finished(run)) => {
-                say("the run is over");
-                return Ok(Some(ExitCode::SUCCESS));
-            }
-            (Ok((Admission::Refused(why), _)), None) if attempt > 1 => {
-                say(format!("error: {endpoint} does not admit this host again: {why}"));
-                return Ok(Some(GAVE_UP.into()));
-            }
-            (Ok((Admission::Refused(why), _)), None) => bail!("{endpoint} does not admit this host: {why}"),
-            (Err(JoinError::Silence { .. }), None) if is_finished(run) => {
-                say("the run is over");
-                return Ok(Some(ExitCode::SUCCESS));
-            }
-            (Err(error @ JoinError::Silence { .. }), None) => {
-                say(format!("error: {error}"));
-                return Ok(Some(GAVE_UP.into()));
-            }
-            (Err(error), None) => return Err(error.into()),
+        let reached = (&endpoint, key.as_ref());
+        let (lease, connection) = match ask_to_be_admitted(args, run, &hello, reached, &interrupt, attempt)? {
+            Answer::Admitted(lease, connection) => (lease, connection),
+            Answer::Exit(code) => return Ok(HostEnd::Exit(code)),
         };
         let temporary = std::env::temp_dir().join(format!("{TEMPORARY_PREFIX}{number:016x}"));
         let path = match (&args.local, attempt) {
@@ -227,6 +212,61 @@ mod with_network {
         worked
     }
 
+    /// What has come of a host's request to be admitted.
+    enum Answer {
+        Admitted(WireLease, GateConnection),
+        Exit(ExitCode),
+    }
+
+    /// Asks the run to admit this host; `attempt` counts from 1.
+    ///
+    /// # Errors
+    /// When the first attempt is refused, or the network fails.
+    fn ask_to_be_admitted(
+        args: &JoinArgs,
+        run: &str,
+        hello: &Hello,
+        (endpoint, key): (&Endpoint, Option<&KeyFile>),
+        interrupt: &Interrupt,
+        attempt: u32,
+    ) -> anyhow::Result<Answer> {
+        let joins_again = attempt > 1;
+        let ends = || interrupt.signal().is_some() || is_finished(run);
+        // When a host joins again, the run may not have got its former actors back yet.
+        let said = Cell::new(false);
+        let ask_again = |why: &str| {
+            if joins_again && !said.replace(true) {
+                say(format!("{endpoint} does not admit this host yet: {why}"));
+            }
+            joins_again
+        };
+        let run_is_over = || {
+            say("the run is over");
+            Ok(Answer::Exit(ExitCode::SUCCESS))
+        };
+        let give_up = |why: String| {
+            say(format!("error: {why}"));
+            Ok(Answer::Exit(GAVE_UP.into()))
+        };
+        match (
+            ask(endpoint, key, hello, args.give_up, ends, ask_again),
+            interrupt.signal(),
+        ) {
+            (Ok((Admission::Admitted(lease), connection)), _) => Ok(Answer::Admitted(lease, connection)),
+            (_, Some(signal)) => Ok(Answer::Exit(exit_code(signal))),
+            (Ok((Admission::RunIsEnding, _)), None) if joins_again => run_is_over(),
+            (Ok((Admission::RunIsEnding, _)), None) => bail!("{endpoint} admits no host: the run is ending"),
+            (Ok((Admission::Refused(_), _)), None) if joins_again && is_finished(run) => run_is_over(),
+            (Ok((Admission::Refused(why), _)), None) if joins_again => {
+                give_up(format!("{endpoint} does not admit this host again: {why}"))
+            }
+            (Ok((Admission::Refused(why), _)), None) => bail!("{endpoint} does not admit this host: {why}"),
+            (Err(JoinError::Silence { .. }), None) if is_finished(run) => run_is_over(),
+            (Err(error @ JoinError::Silence { .. }), None) => give_up(error.to_string()),
+            (Err(error), None) => Err(error.into()),
+        }
+    }
+
     /// The first of `local-NUMBER`, `local-NUMBER+1`, … that does not exist. An earlier `join` may have left some.
     fn unused_name(local: &Path, mut number: u32) -> PathBuf {
         loop {
@@ -244,7 +284,7 @@ mod with_network {
         (lease, connection): (WireLease, GateConnection),
         path: &Path,
         signals: &Signals,
-    ) -> anyhow::Result<Option<ExitCode>> {
+    ) -> anyhow::Result<HostEnd> {
         let JoiningHost {
             number,
             name,
@@ -258,7 +298,7 @@ mod with_network {
         let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
         let interrupt = signals.interrupt();
         if let Some(signal) = interrupt.signal() {
-            return Ok(Some(exit_code(signal)));
+            return Ok(HostEnd::Exit(exit_code(signal)));
         }
         let (config, run) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
         if let Some(key) = key {
@@ -267,7 +307,7 @@ mod with_network {
         HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&run)?;
         if keeper.run_is_over() {
             say("the run is over");
-            return Ok(Some(ExitCode::SUCCESS));
+            return Ok(HostEnd::Exit(ExitCode::SUCCESS));
         }
         let actors = lease.actors.clone();
         say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
@@ -277,12 +317,12 @@ mod with_network {
             // While this process has the lock, so that no other one takes the directory for an abandoned one.
             keep_log(&run);
         }
-        Ok(Some(match ending? {
+        Ok(HostEnd::Exit(match ending? {
             JoinEnd::Over => {
                 say("the run is over");
                 ExitCode::SUCCESS
             }
-            JoinEnd::LostActors => return Ok(None),
+            JoinEnd::JoinAgain(why) => return Ok(HostEnd::JoinAgain(why)),
             JoinEnd::Stopped => ExitCode::SUCCESS,
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {

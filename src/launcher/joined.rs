@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use shoal_common::channel::Domain;
-use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
+use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, JoinAgain, RunStatus};
 use shoal_common::channel::reports::Reports;
 use shoal_common::config::Config;
 use shoal_common::message::one_line;
@@ -33,8 +33,8 @@ pub(crate) enum JoinEnd {
     Over,
     /// The run could not be reached for too long.
     GaveUp,
-    /// The run has given the actors of this host to others.
-    LostActors,
+    /// The host must join again.
+    JoinAgain(JoinAgain),
     /// `shoal stop` ended it.
     Stopped,
     /// This signal ended it.
@@ -75,7 +75,7 @@ struct JoinedLauncher<'a> {
     heartbeats: Reports<Heartbeat>,
     /// The first request to end the work.
     end_request: Option<EndRequest<JoinEnd>>,
-    has_lost_actors: bool,
+    join_again: Option<JoinAgain>,
     /// Since when the relay has had no connection.
     cut_off_since: Option<Instant>,
 }
@@ -103,7 +103,7 @@ impl<'a> JoinedLauncher<'a> {
             log,
             config,
             end_request: None,
-            has_lost_actors: false,
+            join_again: None,
             cut_off_since: None,
         })
     }
@@ -116,16 +116,24 @@ impl<'a> JoinedLauncher<'a> {
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
-            Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::LostActors) => {
+            Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::JoinAgain(JoinAgain::LostActors)) => {
                 self.supervisor.ask_to_end(|role| role == Role::Actor)
             }
             _ => self.supervisor.ask_to_retire(Role::Actor),
         }
-        let was_asked = matches!(ending, Ok(JoinEnd::Stopped | JoinEnd::Interrupted(_)));
-        self.await_end(|role| role == Role::Actor, HAND_OVER, was_asked.then_some(Role::Relay));
+        let hands_over = matches!(
+            ending,
+            Ok(JoinEnd::JoinAgain(JoinAgain::Scaled(_)) | JoinEnd::Stopped | JoinEnd::Interrupted(_))
+        );
+        self.await_end(|role| role == Role::Actor, HAND_OVER, hands_over.then_some(Role::Relay));
         self.supervisor.ask_to_end(|_| true);
         self.await_end(|_| true, OTHERS_END, None);
         self.control.answer_waiting(&ControlResponse::Accepted);
+        let ending = match (ending, &self.end_request) {
+            // The request came while the actors handed over what they had.
+            (Ok(JoinEnd::JoinAgain(_)), Some(request)) => Ok(request.end),
+            (ending, _) => ending,
+        };
         if let Err(error) = &ending {
             self.log.note("launcher", &one_line(error));
         }
@@ -166,8 +174,8 @@ impl<'a> JoinedLauncher<'a> {
             {
                 return Ok(request.end);
             }
-            if self.has_lost_actors && self.end_request.is_none() {
-                return Ok(JoinEnd::LostActors);
+            if let (Some(why), None) = (self.join_again, &self.end_request) {
+                return Ok(JoinEnd::JoinAgain(why));
             }
             let activity = self.supervisor.activity(Role::Relay);
             if let Some(on_relay_ready) = on_relay_ready.take_if(|_| activity.is_some()) {
@@ -208,7 +216,7 @@ impl EndRoles for JoinedLauncher<'_> {
             run,
             supervisor,
             end_request,
-            has_lost_actors,
+            join_again,
             config,
             ..
         } = self;
@@ -228,11 +236,11 @@ impl EndRoles for JoinedLauncher<'_> {
                     supervisor.replace_actor(actor, incarnation);
                     Some(ControlResponse::Accepted)
                 }
-                ControlRequest::JoinAgain => {
-                    *has_lost_actors = true;
+                ControlRequest::JoinAgain(why) => {
+                    *join_again = Some(why);
                     Some(ControlResponse::Accepted)
                 }
-                ControlRequest::Scale { .. } | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {
+                ControlRequest::Scale(_) | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {
                     let why = "this is a joined host: ask on the learner's host";
                     Some(ControlResponse::Refused(why.into()))
                 }

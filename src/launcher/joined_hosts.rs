@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{HostLease, HostState, HostStatus};
 
+use super::shares::ActorHost;
+
 /// The hosts that have joined.
 #[derive(Debug)]
 pub(super) struct JoinedHosts {
@@ -51,6 +53,28 @@ impl JoinedHosts {
             .iter()
             .filter_map(|admitted| admitted.status.clone())
             .collect()
+    }
+
+    /// Each host with its name, cores and wanted actors, in the order in which they were admitted.
+    pub(super) fn actor_hosts(&self) -> impl Iterator<Item = ActorHost> {
+        self.admitted.iter().map(|admitted| ActorHost {
+            name: Some(admitted.lease.name.clone()),
+            cores: admitted.lease.cores,
+            actors: admitted.lease.wanted_actors,
+        })
+    }
+
+    /// Changes the wanted actors of all hosts, in the order of [`actor_hosts`](Self::actor_hosts).
+    pub(super) fn want(&mut self, actors: &[u32]) {
+        for (admitted, wanted) in self.admitted.iter_mut().zip(actors) {
+            admitted.lease.wanted_actors = *wanted;
+        }
+    }
+
+    /// Actors that hosts are about to have more than they have. They are free now, and kept for these hosts.
+    pub(super) fn reserved(&self) -> usize {
+        let more = |lease: &HostLease| (lease.wanted_actors as usize).saturating_sub(lease.actors.len());
+        self.admitted.iter().map(|admitted| more(&admitted.lease)).sum()
     }
 
     /// Whether a host has this actor.

@@ -1,6 +1,6 @@
 //! The launcher's answers to requests from other terminals.
 
-use shoal_common::channel::control::{ControlResponse, RunStatus};
+use shoal_common::channel::control::{ControlResponse, RunStatus, ScaleRequest};
 use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::role::{Activity, Role};
@@ -9,6 +9,7 @@ use shoal_run::records::recorder::Moment;
 use shoal_run::{plan, status};
 
 use super::progress::ProgressLine;
+use super::shares::shares;
 use super::supervisor::Supervisor;
 
 /// The run's status. `initial` is its status when the launcher started.
@@ -44,38 +45,31 @@ pub(super) fn status(
     Ok(status)
 }
 
-/// Changes the number of actors, `now` and for when the run is resumed.
+/// Changes the numbers of actors `now`; that of this host also for when the run is resumed.
 pub(super) fn scale(
     config: &mut Config,
     run: &RunDir,
     supervisor: &mut Supervisor,
-    actors: u32,
+    request: &ScaleRequest,
     now: Moment,
 ) -> anyhow::Result<ControlResponse> {
     if config.run.mode == Mode::Lockstep {
         let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
         return Ok(ControlResponse::Refused(reason.into()));
     }
-    let (max, most) = (config.actors.max, supervisor.max_actors_now());
-    if !(1..=most).contains(&actors) {
-        let reason = if most == max {
-            format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)")
-        } else {
-            format!(
-                "this host can have 1 to {most} actors: the run may have {max} (actors.max, fixed when it was created), \
-                 and other hosts have {}",
-                max - most
-            )
-        };
-        return Ok(ControlResponse::Refused(reason));
-    }
+    let shares = match shares(request, &supervisor.actor_hosts(), config.actors.max) {
+        Ok(shares) => shares,
+        Err(reason) => return Ok(ControlResponse::Refused(reason)),
+    };
+    let here = shares.first().copied().unwrap_or_default();
     // Before the actors start, so that a learner that is started now reads the new number.
-    match plan::store_actors(run, config, actors, now) {
+    match plan::store_actors(run, config, here, now) {
         Ok(scaled) => *config = scaled,
         Err(error) => return Ok(ControlResponse::Refused(format!("{error:#}"))),
     }
-    supervisor.scale(actors);
-    Ok(ControlResponse::Accepted)
+    supervisor.scale(&shares);
+    let total = shares.iter().sum();
+    Ok(ControlResponse::Scaled { here, total })
 }
 
 /// Who waits for whom, in words, by the last heartbeats of actors and learner.

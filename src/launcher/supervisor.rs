@@ -83,6 +83,8 @@ pub(super) struct Supervisor {
     cleaning: Cleaning,
     /// The wanted actors of this host, in order.
     actors: Vec<u32>,
+    /// The number of actors that this host shall have beyond these, as soon as other hosts have given them up.
+    actors_to_take: usize,
     /// The most actors that the run may have on all hosts.
     max_actors: u32,
     /// The number of actors of a lockstep run, on all hosts together. It never changes.
@@ -159,6 +161,7 @@ impl Supervisor {
             window: config.actors.window,
             cleaning: Cleaning::new(),
             actors,
+            actors_to_take: 0,
             joined_hosts: JoinedHosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
             lockstep_actors,

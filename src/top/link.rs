@@ -5,7 +5,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use shoal_common::channel::control::RunStatus;
+use shoal_common::channel::control::{RunStatus, ScaleRequest};
 use shoal_run::client::RunClient;
 use shoal_run::records::recorder::read_evaluations;
 use shoal_run::status::saved_status;
@@ -135,7 +135,13 @@ fn evaluations(client: &RunClient) -> anyhow::Result<Vec<(f64, f64)>> {
 
 fn carry_out(client: &RunClient, request: Request) -> String {
     let (result, success) = match request {
-        Request::Scale(actors) => (client.scale(actors), format!("scaled to {actors} actors")),
+        Request::Scale(actors) => {
+            let request = ScaleRequest {
+                here: Some(actors),
+                ..ScaleRequest::default()
+            };
+            (client.scale(request).map(drop), format!("scaled to {actors} actors"))
+        }
         Request::Stop => (client.stop(), "stopped; the state is saved".into()),
     };
     result.map_or_else(|error| format!("{error:#}"), |()| success)

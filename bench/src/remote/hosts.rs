@@ -181,6 +181,8 @@ impl<'a> RemoteRun<'a> {
             name: format!("host-{host}"),
             epoch: 1,
             actors: (host * actors..(host + 1) * actors).collect(),
+            wanted_actors: actors,
+            cores: 1,
             first_incarnation: (u64::from(host) + 1) * HostLease::INCARNATIONS,
             limit: (u64::from(host) + 2) * HostLease::INCARNATIONS,
         };

@@ -15,8 +15,8 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 use self::message::{AddressedRequest, VERSION, decode, encode};
 pub use self::message::{
-    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RUN_IS_ENDING, RoleState,
-    RoleStatus, RunDirId, RunStatus,
+    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, JoinAgain, RoleState, RoleStatus,
+    RunDirId, RunStatus, ScaleRequest,
 };
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};

@@ -8,10 +8,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{
-    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
-    error::{OutOfRange, check_time_limit},
-};
+use super::{Class, Drawing, Environment, OutOfRange, Picture, RequestError, Signal, Step, check_time_limit};
 
 /// Gravity in m/s².
 const G: f64 = 9.8;

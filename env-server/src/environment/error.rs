@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use shoal_base::section::{in_user_words, refusal};
+use shoal_base::section::{OutOfRange, from, in_user_words, refusal};
 
 /// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -23,16 +23,6 @@ pub enum EnvironmentError {
         /// The parameter and its valid values.
         reason: String,
     },
-}
-
-/// A parameter outside its range.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-#[error("`{key}` is {value}: give a number from {low} to {high}")]
-pub struct OutOfRange {
-    key: &'static str,
-    value: f64,
-    low: f64,
-    high: f64,
 }
 
 /// A request that a running environment refuses.
@@ -82,18 +72,25 @@ pub enum RequestError {
     },
 }
 
-/// Refuses a `value` outside `range`, and NaN.
-pub(super) fn check(key: &'static str, value: f64, range: RangeInclusive<f64>) -> Result<(), OutOfRange> {
+/// Checks the value of a parameter.
+///
+/// ```
+/// let refused = shoal_env_server::environment::check("mass", -1.0, 0.1..=10.0).unwrap_err();
+/// assert_eq!(refused.to_string(), "mass = -1: must be from 0.1 to 10");
+/// ```
+///
+/// # Errors
+/// When it is outside `range`, or NaN.
+pub fn check(key: &str, value: f64, range: RangeInclusive<f64>) -> Result<(), OutOfRange> {
     let (low, high) = range.into_inner();
-    if low <= value && value <= high {
-        Ok(())
-    } else {
-        Err(OutOfRange { key, value, low, high })
-    }
+    from(low, high).check(key, &value)
 }
 
-/// Checks the parameter that every environment has.
-pub(super) fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
+/// Checks the parameter that every environment has, the steps after which an episode is truncated.
+///
+/// # Errors
+/// When it is 0 or above a million.
+pub fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
     check("time_limit", time_limit.into(), 1.0..=1e6)
 }
 

@@ -8,10 +8,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{
-    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
-    error::{OutOfRange, check_time_limit},
-};
+use super::{Class, Drawing, Environment, OutOfRange, Picture, RequestError, Signal, Step, check_time_limit};
 
 /// The map, row by row: S the start, F frozen, H a hole, G the goal.
 pub const MAP: &[u8; STATES] = b"SFFFFHFHFFFHHFFG";

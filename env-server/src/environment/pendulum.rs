@@ -11,9 +11,7 @@ use shoal_base::{
 };
 
 use super::{
-    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
-    angle::wrap,
-    error::{OutOfRange, check, check_time_limit},
+    Class, Drawing, Environment, OutOfRange, Picture, RequestError, Signal, Step, angle::wrap, check, check_time_limit,
 };
 
 /// Δt in s.

@@ -13,7 +13,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{Class, Drawing, Environment, Goal, Picture, RequestError, Signal, Step, angle::wrap, error::OutOfRange};
+use super::{Class, Drawing, Environment, Goal, OutOfRange, Picture, RequestError, Signal, Step, angle::wrap};
 
 /// Δt in s.
 const DT: f64 = 0.05;

@@ -2,7 +2,9 @@
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use shoal_env_server::environment::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step};
+use shoal_env_server::environment::{
+    Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step, check_time_limit,
+};
 use shoal_env_server::space::{EnvironmentSpec, Space};
 use shoal_env_server::stream::Stream;
 
@@ -40,6 +42,7 @@ pub(crate) struct Rail {
 impl Rail {
     /// At rest in the middle.
     pub(crate) fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+        check_time_limit(parameters.time_limit)?;
         Ok(Self {
             parameters,
             x: 0.0,

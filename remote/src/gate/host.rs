@@ -87,6 +87,7 @@ impl Host {
                 (false, false) => HostState::Connected,
             },
             actors: self.lease.actors.len() as u32,
+            wanted_actors: self.lease.wanted_actors,
             rows_per_second: self.rows_per_second,
             resent_chunks: report.map_or(0, |report| report.resent),
             round_trip_us: report.and_then(|report| report.round_trip_us),

@@ -2,35 +2,56 @@
 
 use shoal_common::channel::Domain;
 use shoal_common::role::{Role, RoleInstance};
+use shoal_remote::wire::cores;
 use shoal_run::records::recorder::{Incident, IncidentKind};
 
 use super::Supervisor;
 use crate::launcher::child::Child;
 use crate::launcher::process::name;
+use crate::launcher::shares::ActorHost;
 
 impl Supervisor {
-    /// Changes the wanted number of actors. [`maintain`](Self::maintain) starts or retires them.
-    pub(crate) fn scale(&mut self, actors: u32) {
-        let before = self.actors.len();
-        self.log
-            .note("launcher", &format!("scaled from {before} to {actors} actors"));
-        let detail = format!("{before} to {actors} actors");
-        self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, detail));
-        self.actors.truncate(actors as usize);
-        let missing = actors as usize - self.actors.len();
-        let more: Vec<u32> = self.free_actors().take(missing).collect();
-        self.actors.extend(more);
-        self.actors.sort_unstable();
+    /// Changes the wanted number of actors of each host, in the order of [`actor_hosts`](Self::actor_hosts).
+    /// [`maintain`](Self::maintain) starts or retires those of this host; joined hosts are told by the gate.
+    pub(crate) fn scale(&mut self, shares: &[u32]) {
+        let before = self.actor_count();
+        let [here, joined @ ..] = shares else { return };
+        let what = if joined.is_empty() {
+            format!("{before} to {here} actors")
+        } else {
+            format!("{before} to {here} actors here, joined hosts to {joined:?}")
+        };
+        self.log.note("launcher", &format!("scaled from {what}"));
+        self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, what));
+        self.actors.truncate(*here as usize);
+        self.actors_to_take = *here as usize - self.actors.len();
+        self.joined_hosts.want(joined);
+        self.take_free_actors();
+    }
+
+    /// Takes free actors until this host has as many as are wanted. Another host may have to give some up first.
+    pub(super) fn take_free_actors(&mut self) {
+        if self.actors_to_take > 0 {
+            let more: Vec<u32> = self.free_actors().take(self.actors_to_take).collect();
+            self.actors_to_take -= more.len();
+            self.actors.extend(more);
+            self.actors.sort_unstable();
+        }
+    }
+
+    /// This host, and the joined ones.
+    pub(crate) fn actor_hosts(&self) -> Vec<ActorHost> {
+        let here = ActorHost {
+            name: None,
+            cores: cores(),
+            actors: self.actor_count(),
+        };
+        std::iter::once(here).chain(self.joined_hosts.actor_hosts()).collect()
     }
 
     /// The wanted number of actors on this host.
     pub(crate) fn actor_count(&self) -> u32 {
-        self.actors.len() as u32
-    }
-
-    /// The most actors that this host may have now.
-    pub(crate) fn max_actors_now(&self) -> u32 {
-        self.actor_count() + self.free_actors().count() as u32
+        (self.actors.len() + self.actors_to_take) as u32
     }
 
     /// Indices that neither this host nor another has.

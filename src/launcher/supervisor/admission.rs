@@ -19,6 +19,7 @@ impl Supervisor {
             host,
             name,
             actors: requested,
+            cores,
             held,
         } = request;
         if let Some(lease) = self.joined_hosts.lease(host) {
@@ -30,7 +31,10 @@ impl Supervisor {
             // The services of a retiring actor are in use.
             None => {
                 let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
-                self.free_actors().filter(|index| !exists(*index)).collect()
+                let free = self.free_actors().filter(|index| !exists(*index));
+                let kept = self.actors_to_take + self.joined_hosts.reserved();
+                let free: Vec<u32> = free.collect();
+                free[..free.len().saturating_sub(kept)].to_vec()
             }
         };
         let requested = requested as usize;
@@ -65,7 +69,9 @@ impl Supervisor {
             host,
             name,
             epoch: self.joined_hosts.epoch(),
+            wanted_actors: actors.len() as u32,
             actors,
+            cores,
             first_incarnation,
             limit: first_incarnation + HostLease::INCARNATIONS,
         };
@@ -80,6 +86,7 @@ impl Supervisor {
             self.log.note("launcher", &message);
         }
         self.share_lockstep_actors();
+        self.take_free_actors();
         ControlResponse::Leases {
             epoch: self.joined_hosts.epoch(),
             leases: self.joined_hosts.leases(),

@@ -104,6 +104,7 @@ fn other_hosts_are_shown_below_the_roles() {
         name: name.into(),
         state,
         actors: 4,
+        wanted_actors: 4,
         rows_per_second: 1_234.5,
         resent_chunks: 7,
         round_trip_us: Some(1_250),

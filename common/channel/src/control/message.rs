@@ -7,18 +7,15 @@ use serde::{Deserialize, Serialize};
 use shoal_base::role::Role;
 
 /// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
-pub(super) const VERSION: u32 = 5;
+pub(super) const VERSION: u32 = 6;
 
 /// A request to a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum ControlRequest {
     /// Report the status of the run.
     Status,
-    /// Continue with this many actors.
-    Scale {
-        /// The number of actors.
-        actors: u32,
-    },
+    /// Continue with other numbers of actors.
+    Scale(ScaleRequest),
     /// End the run in an orderly way.
     Stop,
     /// From the gate: admit another host.
@@ -32,8 +29,28 @@ pub enum ControlRequest {
         /// Its incarnation.
         incarnation: u64,
     },
-    /// From a relay: the actors of this host belong to others now, so the host must join again.
-    JoinAgain,
+    /// From a relay: the host must join again.
+    JoinAgain(JoinAgain),
+}
+
+/// The numbers of actors that hosts shall have. A host that is not named keeps its number, or gets a share of `total`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ScaleRequest {
+    /// The number of the learner's host.
+    pub here: Option<u32>,
+    /// Names of joined hosts, each with its number.
+    pub joined: Vec<(String, u32)>,
+    /// The number on all hosts together.
+    pub total: Option<u32>,
+}
+
+/// Why a host must join again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum JoinAgain {
+    /// Its actors belong to others now.
+    LostActors,
+    /// The run wants it to have this many actors.
+    Scaled(u32),
 }
 
 /// What another host asks for.
@@ -45,6 +62,8 @@ pub struct HostRequest {
     pub name: String,
     /// The number of actors that it offers.
     pub actors: u32,
+    /// The number of its processor cores.
+    pub cores: u32,
     /// The actors that an earlier launcher of the run has given it.
     pub held: Vec<u32>,
 }
@@ -60,14 +79,15 @@ pub struct HostLease {
     pub epoch: u64,
     /// The indices of its actors.
     pub actors: Vec<u32>,
+    /// The number of actors that the run wants it to have. If it is another one, the host must join again.
+    pub wanted_actors: u32,
+    /// The number of its processor cores.
+    pub cores: u32,
     /// The first incarnation of its processes.
     pub first_incarnation: u64,
     /// Their incarnations are below this one.
     pub limit: u64,
 }
-
-/// Why a launcher admits no host and changes nothing once it has begun to end the run.
-pub const RUN_IS_ENDING: &str = "the run is ending";
 
 impl HostLease {
     /// Incarnations that a host gets at once: more than it will ever need.
@@ -97,6 +117,8 @@ pub struct HostStatus {
     pub state: HostState,
     /// The number of its actors.
     pub actors: u32,
+    /// The number of actors that it is about to have.
+    pub wanted_actors: u32,
     /// Rows a second that arrive from it.
     pub rows_per_second: f64,
     /// Chunks that it had to send more than once.
@@ -135,8 +157,17 @@ pub enum ControlResponse {
     Status(RunStatus),
     /// The request is being carried out.
     Accepted,
+    /// The run will have these numbers of actors.
+    Scaled {
+        /// On the learner's host.
+        here: u32,
+        /// On all hosts together.
+        total: u32,
+    },
     /// The request is refused, with the reason.
     Refused(String),
+    /// The request is refused, because the run is ending.
+    RunIsEnding,
     /// The host is admitted.
     Admitted(HostLease),
     /// The hosts that are admitted.
@@ -297,6 +328,7 @@ mod tests {
                 name: "node-2".into(),
                 state: HostState::CutOff,
                 actors: 4,
+                wanted_actors: 4,
                 rows_per_second: 1.5,
                 resent_chunks: 3,
                 round_trip_us: Some(250),

@@ -154,6 +154,7 @@ mod tests {
             name: format!("node-{host}"),
             state,
             actors: 4,
+            wanted_actors: 4,
             rows_per_second: 1500.0,
             resent_chunks: 2,
             round_trip_us: Some(900),

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use shoal_common::durable::write_atomically;
 use shoal_common::message::one_line;
 
 /// Why a record was not written or read.
@@ -50,25 +51,32 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// Opens the table at `path`, or creates it with its header. Removes a last line that a crash cut short. A file
-    /// with another header is refused and left unchanged.
-    pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
+    /// Opens the table at `path`, or creates it with its header. Removes a last line that a crash cut short. A table of
+    /// an earlier version may lack columns that `Row` declares with `#[serde(default)]`: they are added, with the values
+    /// of `Row::default()`. A file with any other header is refused and left unchanged.
+    pub(super) fn open<Row: Serialize + DeserializeOwned + Default>(path: &Path) -> Result<Self, RecordError> {
         let write = |cause| RecordError::Write {
             path: path.to_owned(),
             cause,
         };
-        let mut file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .open(path)
-            .map_err(write)?;
-        let end = whole_lines(&file).map_err(write)?;
-        let expected = header_of::<Row>(path)?;
-        let found = first_line(&file, expected.len()).map_err(write)?;
+        let open = || {
+            let mut options = OpenOptions::new();
+            options.read(true).write(true).create(true).truncate(false);
+            options.open(path).map_err(write)
+        };
+        let mut file = open()?;
+        let default = default_table::<Row>(path)?;
+        let header = default.iter().position(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+        let expected = &default[..header];
+        let mut end = whole_lines(&file).map_err(write)?;
+        let mut found = first_line(&file, expected.len()).map_err(write)?;
+        if end > 0 && found != expected && add_columns::<Row>(path, &file, end, &default)? {
+            file = open()?;
+            end = whole_lines(&file).map_err(write)?;
+            found = first_line(&file, expected.len()).map_err(write)?;
+        }
         if (end > 0 && found != expected) || !expected.starts_with(&found) {
-            let [found, expected] = [found, expected].map(|line| String::from_utf8_lossy(&line).trim_end().to_owned());
+            let [found, expected] = [&found, expected].map(|line| String::from_utf8_lossy(line).trim_end().to_owned());
             let reason = format!("its first line is {found:?}, not {expected:?}");
             return Err(RecordError::Malformed {
                 path: path.to_owned(),
@@ -79,7 +87,7 @@ impl Table {
             .and_then(|()| file.seek(SeekFrom::End(0)))
             .map_err(write)?;
         if end == 0 {
-            file.write_all(&expected).map_err(write)?;
+            file.write_all(expected).map_err(write)?;
         }
         Ok(Self::onto(path, file))
     }
@@ -154,15 +162,63 @@ fn first_line(mut file: &File, length: usize) -> io::Result<Vec<u8>> {
     Ok(line)
 }
 
-/// The header line of a table of such rows.
-fn header_of<Row: Serialize + Default>(path: &Path) -> Result<Vec<u8>, RecordError> {
+/// A table of one default row.
+fn default_table<Row: Serialize + Default>(path: &Path) -> Result<Vec<u8>, RecordError> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     writer
         .serialize(Row::default())
         .map_err(|error| malformed(path, &error))?;
-    let mut text = writer.into_inner().unwrap_or_default();
-    text.truncate(text.iter().position(|byte| *byte == b'\n').map_or(0, |end| end + 1));
-    Ok(text)
+    Ok(writer.into_inner().unwrap_or_default())
+}
+
+/// Adds the columns that a table of an earlier version lacks, with the values of `default`, a table of one row. Returns
+/// false, and changes nothing, if the table is of no earlier version. Only its first `end` bytes count.
+fn add_columns<Row: DeserializeOwned>(
+    path: &Path,
+    mut file: &File,
+    end: u64,
+    default: &[u8],
+) -> Result<bool, RecordError> {
+    let write = |cause| RecordError::Write {
+        path: path.to_owned(),
+        cause,
+    };
+    let damaged = |error: csv::Error| malformed(path, &error);
+    file.rewind().map_err(write)?;
+    let mut old = csv::Reader::from_reader(BufReader::new(file.take(end)));
+    let mut default = csv::Reader::from_reader(default);
+    let names = default.byte_headers().map_err(damaged)?.clone();
+    let mut value = csv::ByteRecord::new();
+    default.read_byte_record(&mut value).map_err(damaged)?;
+    let old_names = old.byte_headers().map_err(damaged)?.clone();
+    let places: Vec<Option<usize>> = names
+        .iter()
+        .map(|name| old_names.iter().position(|old| old == name))
+        .collect();
+    let in_old = |of: &csv::ByteRecord| -> csv::ByteRecord {
+        let columns = of.iter().zip(&places).filter(|(_, place)| place.is_some());
+        columns.map(|(field, _)| field).collect()
+    };
+    let has_no_others = in_old(&names).len() == old_names.len();
+    if !has_no_others || in_old(&value).deserialize::<Row>(Some(&in_old(&names))).is_err() {
+        return Ok(false);
+    }
+    let rewritten = write_atomically(path, |file| {
+        let mut new = csv::Writer::from_writer(file);
+        new.write_byte_record(&names)?;
+        for row in old.byte_records() {
+            let row = row?;
+            let fields = places.iter().zip(&value).map(|(place, value)| match place {
+                Some(place) => row.get(*place).unwrap_or_default(),
+                None => value,
+            });
+            new.write_record(fields)?;
+        }
+        new.flush()?;
+        Ok::<_, csv::Error>(())
+    });
+    rewritten.map_err(|error| record_error(path, error))?;
+    Ok(true)
 }
 
 fn record_error(path: &Path, error: csv::Error) -> RecordError {

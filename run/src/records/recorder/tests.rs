@@ -234,6 +234,32 @@ fn every_table_has_its_header_from_the_start() {
 }
 
 #[test]
+fn a_table_of_an_earlier_version_gets_the_columns_that_it_lacks() {
+    let (_parent, run) = run();
+    let old = "wall_seconds,env_steps,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
+               env_steps_per_second,ratio\n1.5,300,20,3,0.25,,-1.0,10.0,20.0,\n";
+    // The last line was cut short.
+    std::fs::write(run.learner_records(), format!("{old}2.5,4")).unwrap();
+    drop(Recorder::open(&run, &without_warmup()).unwrap());
+    let new = text(&run.learner_records());
+    assert_eq!(
+        new.lines().collect::<Vec<_>>(),
+        [
+            "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
+             env_steps_per_second,ratio",
+            "1.5,300,0,20,3,0.25,,-1.0,10.0,20.0,"
+        ]
+    );
+    drop(Recorder::open(&run, &without_warmup()).unwrap());
+    assert_eq!(text(&run.learner_records()), new);
+    // A column that no version lacked.
+    let foreign = old.replace("env_steps,updates", "updates").replace("300,", "");
+    std::fs::write(run.learner_records(), &foreign).unwrap();
+    assert!(Recorder::open(&run, &without_warmup()).is_err());
+    assert_eq!(text(&run.learner_records()), foreign);
+}
+
+#[test]
 fn a_foreign_file_and_a_full_disk_are_one_line_errors() {
     let (_parent, run) = run();
     std::fs::write(run.evaluations(), "a,b\n1,2\n").unwrap();
