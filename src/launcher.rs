@@ -68,7 +68,7 @@ const GATE_END: Duration = Duration::from_secs(8);
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
-/// How often the run's shared memory may be created anew within an hour.
+/// How often the run may get new shared memory within an hour.
 const MAX_RENEWALS: usize = 5;
 const HOUR: Duration = Duration::from_secs(3600);
 
@@ -81,15 +81,22 @@ pub(crate) enum RunEnd {
     Stopped,
     /// This signal ended it; the learner saved its state.
     Interrupted(i32),
-    /// Dead processes occupy shared memory that cannot be freed, or another program has removed files of the run: it
-    /// continues in new shared memory.
-    Renewed,
 }
 
-/// The result of a training.
+/// Why the roles were ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum RolesEnd {
+    /// The run has ended.
+    Run(RunEnd),
+    /// Dead processes occupy shared memory that cannot be freed, or another program has removed files of the run: it
+    /// continues in new shared memory.
+    Renewal,
+}
+
+/// The result of a training, or of a part of it.
 #[derive(Clone, Debug)]
-pub(crate) struct TrainingOutcome {
-    pub(crate) ending: RunEnd,
+pub(crate) struct TrainingOutcome<Ending = RunEnd> {
+    pub(crate) ending: Ending,
     pub(crate) wall: Duration,
     /// The run's status when this launcher started, and now.
     pub(crate) before: RunStatus,
@@ -149,7 +156,7 @@ fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
     }
 }
 
-/// Runs all roles, again and again while their shared memory must be made anew.
+/// Runs all roles, again in new shared memory whenever that is needed.
 fn run_and_renew(
     mut config: Config,
     run: &LockedRun,
@@ -158,21 +165,25 @@ fn run_and_renew(
 ) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, run, signals, options)?;
-        wall += outcome.wall;
-        let before = before.get_or_insert(outcome.before.clone());
-        if outcome.ending != RunEnd::Renewed {
-            let before = before.clone();
+        let part = run_once(config, run, signals, options)?;
+        wall += part.wall;
+        let before = before.get_or_insert(part.before);
+        if let RolesEnd::Run(ending) = part.ending {
             return Ok(TrainingOutcome {
-                before,
+                ending,
                 wall,
-                ..outcome
+                before: before.clone(),
+                after: part.after,
             });
         }
         renewals.retain(|then: &Instant| then.elapsed() < HOUR);
         renewals.push(Instant::now());
         if renewals.len() > MAX_RENEWALS {
-            anyhow::bail!("the run's shared memory was already created anew {MAX_RENEWALS} times within an hour");
+            anyhow::bail!(
+                "the run got new shared memory {MAX_RENEWALS} times within an hour; the log has the reasons. If a program \
+                 cleans up /dev/shm or /tmp, exclude this run's files, then `shoal resume {}` continues the run",
+                run.path().display()
+            );
         }
         // The run may have been scaled.
         config = run.config()?;
@@ -184,7 +195,7 @@ fn run_once(
     run: &LockedRun,
     signals: &Signals,
     options: RunOptions,
-) -> anyhow::Result<TrainingOutcome> {
+) -> anyhow::Result<TrainingOutcome<RolesEnd>> {
     let saved = status::saved_status(&config, run)?;
     let starts =
         RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(OutcomeReason::Starting);
@@ -295,7 +306,7 @@ impl<'a> Launcher<'a> {
         })
     }
 
-    fn run(mut self) -> anyhow::Result<TrainingOutcome> {
+    fn run(mut self) -> anyhow::Result<TrainingOutcome<RolesEnd>> {
         let mut ending = self.watch();
         if let Err(gone) = self.run.check() {
             // The roles cannot save anything. By now, another run may be at this path, so none may be started either.
@@ -305,10 +316,10 @@ impl<'a> Launcher<'a> {
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
         let ended = self.end_all(ending.as_ref().ok().copied());
-        if matches!(ending, Ok(RunEnd::Renewed))
+        if matches!(ending, Ok(RolesEnd::Renewal))
             && let Some(request) = self.end_request
         {
-            ending = Ok(request.end);
+            ending = Ok(RolesEnd::Run(request.end));
         }
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
@@ -320,7 +331,7 @@ impl<'a> Launcher<'a> {
         self.run
             .check()
             .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;
-        let renewed = matches!(ending, Ok(RunEnd::Renewed));
+        let renewed = matches!(ending, Ok(RolesEnd::Renewal));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
         if let Some(error) = failure {
             let why = one_line(error);
@@ -332,16 +343,18 @@ impl<'a> Launcher<'a> {
         }
         let ending = ending?;
         // With new shared memory, the learner continues from its newest checkpoint.
-        ended.or_else(|error| if ending == RunEnd::Renewed { Ok(()) } else { Err(error) })?;
+        ended.or_else(|error| if ending == RolesEnd::Renewal { Ok(()) } else { Err(error) })?;
         self.recorder.flush()?;
         // What the learner saved: its last report may have arrived too late.
         let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            RunEnd::Stopped => stopped.with_reason("by request".to_owned()).write(self.run)?,
-            RunEnd::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
+            RolesEnd::Run(RunEnd::Stopped) => stopped.with_reason("by request".to_owned()).write(self.run)?,
+            RolesEnd::Run(RunEnd::Interrupted(signal)) => {
+                stopped.with_reason(format!("signal {signal}")).write(self.run)?
+            }
             // The final evaluation of a finished run is still to come.
-            RunEnd::Finished | RunEnd::Renewed => {}
+            RolesEnd::Run(RunEnd::Finished) | RolesEnd::Renewal => {}
         }
         Ok(TrainingOutcome {
             ending,
@@ -356,7 +369,7 @@ impl<'a> Launcher<'a> {
         Ok(RunOutcome::new(state, saved.env_steps, saved.episodes))
     }
 
-    fn watch(&mut self) -> anyhow::Result<RunEnd> {
+    fn watch(&mut self) -> anyhow::Result<RolesEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             self.take_signal();
@@ -365,19 +378,19 @@ impl<'a> Launcher<'a> {
             self.answer_requests()?;
             let condition = match (self.supervisor.maintain(self.domain), self.end_request) {
                 // A run that is about to end needs no role that cannot work.
-                (Err(_), Some(request)) => return Ok(request.end),
+                (Err(_), Some(request)) => return Ok(RolesEnd::Run(request.end)),
                 (condition, _) => condition?,
             };
             match condition {
                 supervisor::RunCondition::AtWork => {}
                 supervisor::RunCondition::LearnerDone => {
                     self.await_last_evaluation()?;
-                    return Ok(RunEnd::Finished);
+                    return Ok(RolesEnd::Run(RunEnd::Finished));
                 }
                 supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
                     if self.end_request.is_some() => {}
                 supervisor::RunCondition::SharedMemoryOccupied => {
-                    return Ok(self.report_renewal("dead processes occupy shared memory for good"));
+                    return Ok(self.report_renewal("dead processes occupy shared memory permanently"));
                 }
                 supervisor::RunCondition::FilesRemoved => {
                     let directory = self.domain.directory()?;
@@ -394,7 +407,7 @@ impl<'a> Launcher<'a> {
             if let Some(request) = self.end_request
                 && request.may_begin(&self.supervisor, Role::Learner)
             {
-                return Ok(request.end);
+                return Ok(RolesEnd::Run(request.end));
             }
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.time_to_next_task()));
@@ -412,12 +425,12 @@ impl<'a> Launcher<'a> {
         }
     }
 
-    /// Logs and prints why the run continues in new shared memory. Returns [`RunEnd::Renewed`].
-    fn report_renewal(&self, why: &str) -> RunEnd {
+    /// Logs and prints why the run continues in new shared memory. Returns [`RolesEnd::Renewal`].
+    fn report_renewal(&self, why: &str) -> RolesEnd {
         let why = format!("{why}: the run continues in new shared memory");
         self.log.note("launcher", &why);
         self.progress.print(&why);
-        RunEnd::Renewed
+        RolesEnd::Renewal
     }
 
     /// Waits for the report on the last period's policy.
@@ -436,12 +449,15 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over, or is
-    /// requested to end meanwhile, the other hosts are told so. Otherwise, and after an error, which `None` stands for,
-    /// they are told nothing, and wait.
-    fn end_all(&mut self, ending: Option<RunEnd>) -> anyhow::Result<()> {
+    /// Ends all roles, the actors first, so that the learner still receives what they send. The other hosts are told if
+    /// the run is over, also if a request to end it comes while the roles end. If it is renewed, or after an error
+    /// (`None`), they are not told, and wait for it.
+    fn end_all(&mut self, ending: Option<RolesEnd>) -> anyhow::Result<()> {
         self.is_ending = true;
-        let was_asked = matches!(ending, Some(RunEnd::Stopped | RunEnd::Interrupted(_)));
+        let was_asked = matches!(
+            ending,
+            Some(RolesEnd::Run(RunEnd::Stopped | RunEnd::Interrupted(_)))
+        );
         let receiver = was_asked.then_some(Role::Learner);
         // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
         if was_asked && self.config.run.mode == Mode::Free {
@@ -452,8 +468,8 @@ impl<'a> Launcher<'a> {
         self.await_end(|role| role == Role::Actor, ACTORS_END, receiver);
         self.take_signal();
         let is_over = |end_request: Option<_>| match ending {
-            Some(RunEnd::Renewed) => end_request.is_some(),
-            Some(_) => true,
+            Some(RolesEnd::Renewal) => end_request.is_some(),
+            Some(RolesEnd::Run(_)) => true,
             None => false,
         };
         let are_told = is_over(self.end_request);

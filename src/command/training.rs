@@ -149,7 +149,7 @@ fn train_and_report(
     Ok(match outcome.ending {
         // The final evaluation may have been interrupted.
         RunEnd::Finished => signals.interrupt().signal().map_or(ExitCode::SUCCESS, exit_code),
-        RunEnd::Stopped | RunEnd::Renewed => ExitCode::SUCCESS,
+        RunEnd::Stopped => ExitCode::SUCCESS,
         // As a shell reports a process that was ended by the signal.
         RunEnd::Interrupted(signal) => exit_code(signal),
     })

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow};
 use shoal_common::channel::control::{ControlPort, HostLease, RoleStatus};
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
@@ -377,7 +377,7 @@ impl Supervisor {
             !self.cleaning.is_due() || self.cleaning.clean_if_needed(domain, &self.services, &self.log)
         };
         for i in 0..self.children.len() {
-            if self.maintain_one(i)? == RunCondition::LearnerDone {
+            if self.maintain_one(i)? {
                 return Ok(RunCondition::LearnerDone);
             }
         }
@@ -400,11 +400,12 @@ impl Supervisor {
         ended.is_some_and(|status| status.success())
     }
 
-    fn maintain_one(&mut self, i: usize) -> anyhow::Result<RunCondition> {
+    /// Returns whether this is the learner, and it is done.
+    fn maintain_one(&mut self, i: usize) -> anyhow::Result<bool> {
         if let Some(status) = self.children[i].ended.take()
-            && self.handle_end(i, status)? == RunCondition::LearnerDone
+            && self.handle_end(i, status)?
         {
-            return Ok(RunCondition::LearnerDone);
+            return Ok(true);
         }
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
@@ -414,10 +415,11 @@ impl Supervisor {
             self.start(i)?;
             self.note_incident(i, IncidentKind::StartedAgain, String::new());
         }
-        Ok(RunCondition::AtWork)
+        Ok(false)
     }
 
-    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<RunCondition> {
+    /// Returns whether this is the learner, and it is done.
+    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<bool> {
         let child = &mut self.children[i];
         let name = name(child.instance);
         self.log.write_left_out(&name);
@@ -425,14 +427,14 @@ impl Supervisor {
             child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
-            return Ok(RunCondition::LearnerDone);
+            return Ok(true);
         }
         if child.is_retiring {
             child.process = None;
             child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", describe_exit(status)));
             self.note_incident(i, IncidentKind::Retired, String::new());
-            return Ok(RunCondition::AtWork);
+            return Ok(false);
         }
         let decision = child.handle_end(status, self.give_up_after);
         self.note_incident(i, kind_of_end(status), describe_exit(status));
@@ -441,11 +443,11 @@ impl Supervisor {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; restarting it in {pause:?}", describe_exit(status)));
-                Ok(RunCondition::AtWork)
+                Ok(false)
             }
             RestartDecision::GiveUp(starts) => {
                 self.note_incident(i, IncidentKind::GivenUp, String::new());
-                self.give_up(&name, starts, status)
+                Err(self.give_up_error(&name, starts, status))
             }
         }
     }
@@ -513,21 +515,21 @@ impl Supervisor {
             .push(Incident::of(self.children[i].instance, what, detail));
     }
 
-    /// The error, in one line: the role, what happened, its last message, and what to do. The log has its earlier
+    /// Why the run ends, in one line: the role, what happened, its last message, and what to do. The log has its earlier
     /// messages.
-    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<RunCondition> {
+    fn give_up_error(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Error {
         let lines = self.log.last_lines(name);
         let message = match lines.last() {
             None if status.signal().is_some() => "it wrote no message; is memory short?",
             None => "it wrote no message",
             Some(last) => last.strip_prefix("error: ").unwrap_or(last),
         };
-        bail!(
+        anyhow!(
             "{name} failed {starts} times and is given up ({}): {message}; see shoal.log in the run's directory, fix \
              the cause, then `shoal resume {}` continues the run",
             describe_exit(status),
             self.run.display()
-        );
+        )
     }
 }
 
