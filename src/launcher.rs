@@ -557,7 +557,7 @@ impl EndRoles for Launcher<'_> {
             ..
         } = self;
         control.answer_requests(
-            run.directory_id()?,
+            run.id(),
             run.path(),
             |request| -> anyhow::Result<Option<ControlResponse>> {
                 match request {

@@ -5,8 +5,9 @@
 mod support;
 
 use std::process::Command;
+use std::time::Duration;
 
-use rustix::process::Signal;
+use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use shoal_common::channel::Domain;
 use support::{Workplace, error_line, parse, until};
 
@@ -129,6 +130,48 @@ fn a_clean_up_whose_launcher_has_died_is_refused() {
     let message = error_line(&clean_up(0));
     assert!(message.contains("the parent process has ended"), "{message}");
     assert!(clean_up(std::process::id()).status.success());
+}
+
+#[test]
+fn a_run_without_free_file_descriptors_continues_when_there_are_some_again() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    running.wait_for_learning();
+    let launcher = Pid::from_raw(running.launcher() as i32);
+    let limit = |limit: Rlimit| prlimit(launcher, Resource::Nofile, limit).unwrap();
+    // Descriptors that are open stay open.
+    let before = limit(Rlimit {
+        current: Some(3),
+        ..getrlimit(Resource::Nofile)
+    });
+    running.kill("actor-0");
+    until("the actor cannot be started", || {
+        running.log().matches("cannot start actor 0").count() >= 2
+    });
+    assert!(running.pids("actor-0").is_empty());
+    limit(before);
+    until("the actor is started again", || running.pids("actor-0").len() == 1);
+    running.wait_for_learning();
+    assert!(!running.log().contains("removed files"), "{}", running.log());
+    running.signal(Signal::TERM);
+    assert_eq!(running.wait().0, Some(143), "{}", place.stderr());
+}
+
+#[test]
+fn a_run_whose_directory_cannot_be_inspected_for_a_moment_continues() {
+    let place = Workplace::new();
+    let running = place.start("above/run", &ENDLESS);
+    running.wait_for_learning();
+    let [above, moved] = ["above", "moved"].map(|name| place.path().join(name));
+    std::fs::rename(&above, &moved).unwrap();
+    // A link to itself: the system refuses to inspect what is below it, and does not say that it does not exist.
+    std::os::unix::fs::symlink(&above, &above).unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    std::fs::remove_file(&above).unwrap();
+    std::fs::rename(&moved, &above).unwrap();
+    running.wait_for_learning();
+    running.signal(Signal::TERM);
+    assert_eq!(running.wait().0, Some(143), "{}", place.stderr());
 }
 
 #[test]

@@ -111,6 +111,13 @@ fn write(path: &Path, head: &str, config: &Config) -> Result<(), RunDirError> {
     write_atomically(path, |file| write!(file, "{head}{text}")).map_err(io)
 }
 
+fn id_of(directory: &std::fs::Metadata) -> RunDirId {
+    RunDirId {
+        device: directory.dev(),
+        inode: directory.ino(),
+    }
+}
+
 /// How long `config.toml` may be missing: some editors rename the old file before they write the new one.
 const EDITING: Duration = Duration::from_millis(300);
 
@@ -119,7 +126,9 @@ const EDITING: Duration = Duration::from_millis(300);
 #[derive(Debug)]
 pub struct LockedRun {
     run: RunDir,
-    directory: File,
+    id: RunDirId,
+    /// Its handle holds the lock.
+    _directory: File,
 }
 
 impl Deref for LockedRun {
@@ -136,13 +145,17 @@ impl LockedRun {
         self.run
     }
 
-    /// Whether another directory, or nothing, is at the path now.
+    /// What distinguishes the directory from its copies.
+    pub fn id(&self) -> RunDirId {
+        self.id
+    }
+
+    /// Whether another directory, or nothing, is at the path now. What cannot be inspected for the moment, as on a busy
+    /// network file system, is not gone.
     fn is_elsewhere(&self) -> bool {
-        let number = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
-        match (self.directory.metadata(), std::fs::metadata(&self.run.path)) {
-            (Ok(locked), Ok(there)) => number(locked) != number(there),
-            (_, Err(error)) => matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory),
-            (Err(_), Ok(_)) => false,
+        match std::fs::metadata(&self.run.path) {
+            Ok(there) => id_of(&there) != self.id,
+            Err(error) => matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory),
         }
     }
 
@@ -154,7 +167,6 @@ impl LockedRun {
         let run = &self.run;
         let since = Instant::now();
         while !self.is_elsewhere() {
-            // What cannot be inspected for the moment, as on a busy network file system, is not gone.
             if !matches!(run.config_file().try_exists(), Ok(false)) {
                 return Ok(());
             }
@@ -254,7 +266,8 @@ impl RunDir {
         }
         let locked = LockedRun {
             run: self.clone(),
-            directory: file,
+            id: id_of(&file.metadata().map_err(io)?),
+            _directory: file,
         };
         // Its last owner may have removed it meanwhile.
         if locked.is_elsewhere() {
@@ -287,10 +300,7 @@ impl RunDir {
             path: self.path.clone(),
             cause,
         })?;
-        Ok(RunDirId {
-            device: metadata.dev(),
-            inode: metadata.ino(),
-        })
+        Ok(id_of(&metadata))
     }
 
     /// The resolved configuration that the run was last used with, which its files belong to. `config.toml` may have

@@ -219,8 +219,19 @@ impl Child {
         if was_killed && blameless {
             return RestartDecision::Restart(if self.is_ready() { Duration::ZERO } else { FIRST_PAUSE });
         }
+        self.count_failure(self.started_at, give_up_after, now)
+    }
+
+    /// Handles a start that the system refused. The role is given up if its failures span `give_up_after`.
+    pub(super) fn handle_refused_start(&mut self, give_up_after: Duration) -> RestartDecision {
+        let now = Instant::now();
+        self.count_failure(now, give_up_after, now)
+    }
+
+    /// Counts a failure of a start that began at `begun`.
+    fn count_failure(&mut self, begun: Instant, give_up_after: Duration, now: Instant) -> RestartDecision {
         self.failures += 1;
-        let since = *self.failing_since.get_or_insert(self.started_at);
+        let since = *self.failing_since.get_or_insert(begun);
         let longest = self
             .longest_failed_start
             .max(self.longest_good_start.unwrap_or_default());

@@ -220,7 +220,7 @@ impl EndRoles for JoinedLauncher<'_> {
             config,
             ..
         } = self;
-        control.answer_requests(run.directory_id()?, run.path(), |request| {
+        control.answer_requests(run.id(), run.path(), |request| {
             Ok::<_, anyhow::Error>(match request {
                 ControlRequest::Status => Some(ControlResponse::Status(RunStatus {
                     roles: supervisor.status(0),

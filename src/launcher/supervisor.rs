@@ -193,7 +193,7 @@ impl Supervisor {
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
         self.reserve_incarnations((self.children.len() + self.missing().len()) as u64)?;
-        (0..self.children.len()).try_for_each(|i| self.start(i))?;
+        (0..self.children.len()).try_for_each(|i| self.start(i).map(drop))?;
         self.start_missing(domain)
     }
 
@@ -223,7 +223,12 @@ impl Supervisor {
         Ok(first)
     }
 
-    fn start(&mut self, i: usize) -> anyhow::Result<()> {
+    /// Starts a role's process. If the system refuses to, as it does while there are too many processes or open files,
+    /// it is tried again later. Returns whether there is a process.
+    ///
+    /// # Errors
+    /// When the counter of incarnations cannot be written, or the system has refused for too long.
+    fn start(&mut self, i: usize) -> anyhow::Result<bool> {
         let incarnation = self.take_incarnations(1)?;
         let child = &mut self.children[i];
         child.instance.incarnation = incarnation;
@@ -231,11 +236,32 @@ impl Supervisor {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
         };
-        let process = Process::start(child.instance, &self.run, &self.log, writer)?;
+        let started = Process::start(child.instance, &self.run, &self.log, writer);
+        let process = match started {
+            Ok(process) => process,
+            Err(error) => return self.handle_refused_start(i, error).map(|()| false),
+        };
+        let child = &mut self.children[i];
         self.log
             .note(&name(child.instance), &format!("started as process {}", process.pid()));
         child.begin(process);
-        Ok(())
+        Ok(true)
+    }
+
+    fn handle_refused_start(&mut self, i: usize, error: anyhow::Error) -> anyhow::Result<()> {
+        let child = &mut self.children[i];
+        let name = name(child.instance);
+        match child.handle_refused_start(self.give_up_after) {
+            RestartDecision::Restart(pause) => {
+                child.restart_at = Instant::now() + pause;
+                self.log.note(&name, &format!("{error:#}; trying again in {pause:?}"));
+                Ok(())
+            }
+            RestartDecision::GiveUp(starts) => {
+                self.note_incident(i, IncidentKind::GivenUp, String::new());
+                Err(error.context(format!("{name} is given up after {starts} attempts")))
+            }
+        }
     }
 
     /// Starts the gate again if it has just died and other hosts are waiting for news. Returns whether it was started.
@@ -269,8 +295,10 @@ impl Supervisor {
             self.note_incident(i, kind_of_end(status), describe_exit(status));
         }
         self.cleaning.clean(domain, &self.services, &self.log);
+        if !self.start(i)? {
+            return Ok(false);
+        }
         self.children[i].restarts += 1;
-        self.start(i)?;
         if role == Role::Learner {
             self.unsaved_learner = None;
         }
@@ -411,9 +439,11 @@ impl Supervisor {
         let child = &mut self.children[i];
         if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
             // One that has retired and is wanted again did not fail.
-            child.restarts += u32::from(!child.is_retiring);
-            self.start(i)?;
-            self.note_incident(i, IncidentKind::StartedAgain, String::new());
+            let restarts = child.restarts + u32::from(!child.is_retiring);
+            if self.start(i)? {
+                self.children[i].restarts = restarts;
+                self.note_incident(i, IncidentKind::StartedAgain, String::new());
+            }
         }
         Ok(false)
     }

@@ -181,16 +181,23 @@ impl Domain {
     }
 
     /// Whether the run's files outside `/dev/shm` still exist, including those of `services` services. Without them the
-    /// processes of the run no longer find each other.
+    /// processes of the run no longer find each other. What cannot be inspected, as when too many files are open, counts
+    /// as existing.
     pub fn is_intact(&self, services: usize) -> bool {
         let Ok(directory) = self.directory() else {
-            return false;
+            return true;
         };
         let node = directory.join("nodes").join(self.node.id().value().to_string());
         let details = node.join(format!("{}node.details", prefix(&self.run_id)));
-        let listed = std::fs::read_dir(directory.join("services")).map_or(0, Iterator::count);
-        let same = std::fs::metadata(&directory).is_ok_and(|now| (now.dev(), now.ino()) == self.root);
-        same && details.exists() && listed >= services
+        let same = match std::fs::metadata(&directory) {
+            Ok(now) => (now.dev(), now.ino()) == self.root,
+            Err(error) => !is_missing(&error),
+        };
+        let has_services = match std::fs::read_dir(directory.join("services")) {
+            Ok(listed) => listed.count() >= services,
+            Err(error) => !is_missing(&error),
+        };
+        same && has_services && std::fs::metadata(details).map_or_else(|error| !is_missing(&error), |_| true)
     }
 
     /// Whether a process of the run is alive, even one that iceoryx2 does not find. Visitors are not counted.
@@ -273,6 +280,10 @@ impl Domain {
         }
         Ok(())
     }
+}
+
+fn is_missing(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory)
 }
 
 fn claim(run_id: &str) -> Result<Claim, DomainError> {
