@@ -30,6 +30,7 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::role::Role;
 use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_common::stop::GRACE;
+use shoal_run::client::in_final_evaluation;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use shoal_run::records::recorder::Recorder;
@@ -238,6 +239,16 @@ fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
     }
 }
 
+/// What the launcher is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    AtWork,
+    /// It ends the roles, and the run with them.
+    RunEnds,
+    /// It ends the roles, because the run has failed or moves to new shared memory.
+    RolesEnd,
+}
+
 struct Launcher<'a> {
     config: Config,
     run: &'a LockedRun,
@@ -247,8 +258,7 @@ struct Launcher<'a> {
     initial: RunStatus,
     /// The first request to end the run.
     end_request: Option<EndRequest<RunEnd>>,
-    /// Whether the roles are being ended.
-    is_ending: bool,
+    phase: Phase,
     supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
@@ -287,7 +297,7 @@ impl<'a> Launcher<'a> {
             control: ControlPort::open(domain)?,
             initial,
             end_request: None,
-            is_ending: false,
+            phase: Phase::AtWork,
             run,
             domain,
             heartbeats: Reports::open(domain)?,
@@ -322,9 +332,11 @@ impl<'a> Launcher<'a> {
             ending = Ok(RolesEnd::Run(request.end));
         }
         self.progress.clear();
-        self.control.answer_waiting(&match &ended {
-            Ok(()) => ControlResponse::Accepted,
-            Err(error) => ControlResponse::Refused(format!("{error:#}")),
+        self.control.answer_waiting(&match (&ended, &ending) {
+            // A request to stop came too late.
+            (Ok(()), Ok(RolesEnd::Run(RunEnd::Finished))) => ControlResponse::Refused(in_final_evaluation(self.run)),
+            (Ok(()), _) => ControlResponse::Accepted,
+            (Err(error), _) => ControlResponse::Refused(format!("{error:#}")),
         });
         // If the directory is gone, all other errors follow from that, and nothing may be written at its path. The open
         // log is still the run's own.
@@ -343,7 +355,13 @@ impl<'a> Launcher<'a> {
         }
         let ending = ending?;
         // With new shared memory, the learner continues from its newest checkpoint.
-        ended.or_else(|error| if ending == RolesEnd::Renewal { Ok(()) } else { Err(error) })?;
+        ended.or_else(|error| {
+            if ending == RolesEnd::Renewal {
+                Ok(())
+            } else {
+                Err(error)
+            }
+        })?;
         self.recorder.flush()?;
         // What the learner saved: its last report may have arrived too late.
         let after = status::saved_status(&self.config, self.run)?;
@@ -453,11 +471,11 @@ impl<'a> Launcher<'a> {
     /// the run is over, also if a request to end it comes while the roles end. If it is renewed, or after an error
     /// (`None`), they are not told, and wait for it.
     fn end_all(&mut self, ending: Option<RolesEnd>) -> anyhow::Result<()> {
-        self.is_ending = true;
-        let was_asked = matches!(
-            ending,
-            Some(RolesEnd::Run(RunEnd::Stopped | RunEnd::Interrupted(_)))
-        );
+        self.phase = match ending {
+            Some(RolesEnd::Run(_)) => Phase::RunEnds,
+            Some(RolesEnd::Renewal) | None => Phase::RolesEnd,
+        };
+        let was_asked = matches!(ending, Some(RolesEnd::Run(RunEnd::Stopped | RunEnd::Interrupted(_))));
         let receiver = was_asked.then_some(Role::Learner);
         // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
         if was_asked && self.config.run.mode == Mode::Free {
@@ -550,7 +568,7 @@ impl EndRoles for Launcher<'_> {
             supervisor,
             progress,
             initial,
-            is_ending,
+            phase,
             end_request,
             log,
             domain,
@@ -567,11 +585,13 @@ impl EndRoles for Launcher<'_> {
                             Err(error) => ControlResponse::Refused(error.to_string()),
                         },
                     )),
-                    ControlRequest::Scale(_) if *is_ending => Ok(Some(ControlResponse::RunIsEnding)),
+                    ControlRequest::Scale(_) if *phase == Phase::RunEnds => Ok(Some(ControlResponse::RunIsEnding)),
+                    ControlRequest::Scale(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
                     ControlRequest::Scale(request) => requests::scale(config, run, supervisor, &request, now).map(Some),
-                    ControlRequest::Admit(_) if *is_ending || end_request.is_some() => {
+                    ControlRequest::Admit(_) if *phase == Phase::RunEnds || end_request.is_some() => {
                         Ok(Some(ControlResponse::RunIsEnding))
                     }
+                    ControlRequest::Admit(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
                     ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
                     ControlRequest::Replace { .. } | ControlRequest::JoinAgain(_) => {
@@ -594,6 +614,11 @@ impl EndRoles for Launcher<'_> {
             self.tick = SHORTEST_TICK;
         }
     }
+}
+
+/// The answer to a request that needs roles, while they end and the run may continue with others.
+fn roles_are_ending() -> ControlResponse {
+    ControlResponse::Refused("the run has failed, or moves to new shared memory; try again".into())
 }
 
 /// Passes all received reports to `handle`. Returns the fraction of one sender's buffer that they would fill.

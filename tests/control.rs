@@ -213,6 +213,27 @@ fn a_learner_killed_just_before_a_signal_is_replaced_before_the_run_ends() {
 }
 
 #[test]
+fn a_stop_that_comes_after_the_last_step_is_refused() {
+    let place = Workplace::new();
+    let long = ["--steps", "3000", "--set", "evaluation.final_episodes=20000"];
+    let running = place.start("run", &long);
+    until("the learner is done", || running.log().contains("learner-0 done"));
+    running.signal(Signal::STOP);
+    let stop = place.shoal(&["stop", "run"]).stderr(Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(500));
+    running.signal(Signal::CONT);
+    let refused = stop.wait_with_output().unwrap();
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(
+        stderr(&refused).contains("its final evaluation is under way"),
+        "{}",
+        stderr(&refused)
+    );
+    running.signal(Signal::TERM);
+    running.wait();
+}
+
+#[test]
 fn a_stopped_run_resumes_where_it_stopped() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);

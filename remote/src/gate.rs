@@ -332,7 +332,7 @@ impl<'a> Gate<'a> {
             // The empty acknowledgement makes it ask to be admitted.
             return self.acknowledge_nothing(report.host);
         };
-        host.heard_at = Instant::now();
+        (host.heard_at, host.is_known) = (Instant::now(), true);
         if report.number <= host.last_report {
             return Ok(());
         }
@@ -432,7 +432,7 @@ impl<'a> Gate<'a> {
                         limit: lease.limit,
                     };
                     self.epoch = Some(lease.epoch);
-                    self.admit(lease)?;
+                    self.admit(lease, true)?;
                     answer_join(&query, &Admission::Admitted(answer))?;
                 }
                 (Ok(ControlResponse::RunIsEnding), PendingRequest::Join(query, _)) => {
@@ -451,7 +451,7 @@ impl<'a> Gate<'a> {
                     let released = |host: &u64| !leases.iter().any(|lease| lease.host == *host);
                     let gone: Vec<u64> = self.hosts.keys().copied().filter(released).collect();
                     gone.iter().for_each(|host| self.release(*host));
-                    leases.into_iter().try_for_each(|lease| self.admit(lease))?;
+                    leases.into_iter().try_for_each(|lease| self.admit(lease, false))?;
                 }
                 (answer, PendingRequest::Hosts) => {
                     tracing::debug!("the launcher did not say which hosts are admitted: {answer:?}")
@@ -461,8 +461,8 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// Takes in a host, or what it has been given anew.
-    fn admit(&mut self, lease: HostLease) -> Result<(), GateError> {
+    /// Takes in a host, or what it has been given again. `asks` is whether the host has just asked for it.
+    fn admit(&mut self, lease: HostLease, asks: bool) -> Result<(), GateError> {
         if let Some(host) = self.hosts.get_mut(&lease.host) {
             // Another number of actors is only announced: the host joins again for it.
             host.lease.wanted_actors = lease.wanted_actors;
@@ -470,7 +470,7 @@ impl<'a> Gate<'a> {
                 return Ok(());
             }
         }
-        let report = self.hosts.get(&lease.host).map_or(0, |host| host.last_report);
+        let report = self.hosts.get(&lease.host).map_or((0, 0), |host| host.last_report);
         self.release(lease.host);
         let config = &self.settings.config;
         for actor in &lease.actors {
@@ -489,6 +489,7 @@ impl<'a> Gate<'a> {
             acknowledged_at: now,
             acknowledgement_due: true,
             heard_at: now,
+            is_known: asks,
             last_report: report,
             has_left: false,
             newest_report: None,
@@ -609,7 +610,7 @@ impl<'a> Gate<'a> {
                 RunPhase::Running
             },
             rows: self.replay.rows(),
-            report: 0,
+            report: (0, 0),
             wanted_actors: 0,
             actors: Vec::new(),
         })

@@ -91,7 +91,7 @@ impl LeaseKeeper {
                 .callback(move |sample| hear(&sample.payload().to_bytes()))
                 .wait();
             let send = |number, leaving| {
-                let report = HostReport::without_processes(host, number, leaving);
+                let report = HostReport::without_processes(host, (0, number), leaving);
                 if let Ok(bytes) = report.encode() {
                     // If it is lost, the next one may arrive; without any, the host loses its actors after a while.
                     let _ = connection.0.put(&key, bytes).wait();
@@ -125,9 +125,10 @@ impl LeaseKeeper {
         })
     }
 
-    /// Whether the run has ended since the host was admitted.
-    pub fn run_is_over(&self) -> bool {
-        self.run_is_over.load(Ordering::Relaxed)
+    /// Says whether the run has ended since the host was admitted.
+    pub fn run_is_over(&self) -> impl Fn() -> bool + use<> {
+        let run_is_over = Arc::clone(&self.run_is_over);
+        move || run_is_over.load(Ordering::Relaxed)
     }
 
     /// Ends the reports, because the relay sends them from now on. The connection may take a while to close.

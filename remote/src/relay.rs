@@ -30,8 +30,8 @@ use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_I
 use crate::requests::LauncherRequests;
 use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
 use crate::wire::{
-    Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, RunPhase,
-    WireChunk, WireError, WirePolicy, cores, id_of, vector_instructions,
+    Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, ReportNumber,
+    RunPhase, WireChunk, WireError, WirePolicy, cores, id_of, vector_instructions,
 };
 
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
@@ -153,7 +153,8 @@ struct Relay<'a> {
     heartbeat: HeartbeatSender,
     heartbeat_reports: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
-    roles: BTreeMap<(Role, u32), RemoteRole>,
+    /// The last heartbeats of actors and environment servers, with the times of their arrival.
+    roles: BTreeMap<(Role, u32), (Instant, RemoteRole)>,
     episodes: Vec<RemoteEpisode>,
     epoch: u64,
     /// Gate and number of the newest acknowledgement.
@@ -163,7 +164,7 @@ struct Relay<'a> {
     /// Number and time of the last report.
     last_report: (u64, Instant),
     /// A report that no acknowledgement has confirmed yet.
-    unconfirmed_report: Option<(u64, Instant)>,
+    unconfirmed_report: Option<(ReportNumber, Instant)>,
     round_trip: Option<Duration>,
     connections_refreshed_at: Instant,
     /// When this host last asked to be admitted again, and whether an answer is still to come.
@@ -539,7 +540,7 @@ impl<'a> Relay<'a> {
     fn read_reports(&mut self) -> Result<(), RelayError> {
         while let Some(heartbeat) = self.heartbeat_reports.receive()? {
             if let Some(role) = RemoteRole::of(&heartbeat).filter(|role| role.role != Role::Relay) {
-                self.roles.insert((role.role, role.index), role);
+                self.roles.insert((role.role, role.index), (Instant::now(), role));
             }
         }
         while let Some(episode) = self.episode_reports.receive()? {
@@ -553,7 +554,7 @@ impl<'a> Relay<'a> {
     fn send_report(&mut self, leaving: bool) -> Result<(), RelayError> {
         let now = Instant::now();
         self.last_report = (self.last_report.0 + 1, now);
-        let number = self.number();
+        let number = (self.settings.instance.incarnation, self.last_report.0);
         self.unconfirmed_report.get_or_insert((number, now));
         // What is sent while the gate is away is lost.
         let episodes = if self.is_cut_off() {
@@ -561,6 +562,7 @@ impl<'a> Relay<'a> {
         } else {
             std::mem::take(&mut self.episodes)
         };
+        self.roles.retain(|_, (heard, _)| heard.elapsed() < CUT_OFF_AFTER);
         let report = HostReport {
             host: self.settings.host.host,
             number,
@@ -568,7 +570,7 @@ impl<'a> Relay<'a> {
             leaving,
             resent: self.actors.values().map(|actor| actor.uncommitted.resent()).sum(),
             policy_version: self.newest_policy.get().map_or(0, |(_, version)| version),
-            roles: self.roles.values().copied().collect(),
+            roles: self.roles.values().map(|(_, role)| *role).collect(),
             episodes,
         };
         self.report_publisher
@@ -580,11 +582,6 @@ impl<'a> Relay<'a> {
             self.session.close().wait().map_err(failed("close"))?;
         }
         Ok(())
-    }
-
-    /// The number of this report. It grows over restarts of the relay, whose incarnations grow.
-    fn number(&self) -> u64 {
-        (self.settings.instance.incarnation << 32) + self.last_report.0
     }
 
     fn refresh_connections(&mut self) -> Result<(), RelayError> {

@@ -278,7 +278,7 @@ pub struct Acknowledgement {
     /// Rows in the replay.
     pub rows: u64,
     /// The number of the last report that the gate has received from this host.
-    pub report: u64,
+    pub report: ReportNumber,
     /// The number of actors that the run wants this host to have.
     pub wanted_actors: u32,
     /// For each actor of the host.
@@ -300,13 +300,17 @@ pub struct ActorAcknowledgement {
     pub snapshot: Vec<u64>,
 }
 
+/// Incarnation of the relay that sends a report, and the number of the report among those of this relay. A host without
+/// a relay has incarnation 0.
+pub type ReportNumber = (u64, u64);
+
 /// What a host tells the gate a few times a second. Some may be lost.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HostReport {
     /// The host.
     pub host: u64,
     /// The number of this report.
-    pub number: u64,
+    pub number: ReportNumber,
     /// Microseconds between an earlier report and the acknowledgement that confirmed it; `None` before the first.
     pub round_trip_us: Option<u64>,
     /// Whether the host is leaving the run, and sends nothing more.
@@ -323,7 +327,7 @@ pub struct HostReport {
 
 impl HostReport {
     /// The report of a host without processes.
-    pub fn without_processes(host: u64, number: u64, leaving: bool) -> Self {
+    pub fn without_processes(host: u64, number: ReportNumber, leaving: bool) -> Self {
         Self {
             host,
             number,

@@ -65,7 +65,7 @@ fn acknowledgement() -> Acknowledgement {
         number: 3,
         phase: RunPhase::Running,
         rows: 640,
-        report: 2,
+        report: (7, 2),
         wanted_actors: 1,
         actors: vec![ActorAcknowledgement {
             actor: 1,
@@ -80,7 +80,7 @@ fn acknowledgement() -> Acknowledgement {
 fn report() -> HostReport {
     HostReport {
         host: 9,
-        number: 3,
+        number: (7, 3),
         round_trip_us: Some(150),
         leaving: false,
         resent: 1,
@@ -171,8 +171,8 @@ fn the_bytes_are_those_of_this_format() {
         "0200736802000000010000000000000002000000000000000300000000000000040000000000000005000000000000000000c03f",
         "030073680200000005302e312e3009046e6f646504617678320408020102",
         "04007368020000000006065b72756e5d0a020102fbe803fbd007",
-        "0500736802000000060803 00fb80020201010107040705fb00010201fb2c01",
-        "060073680200000009030196000103010101000007fb800203010100c80000000000009061c003fb8002",
+        "0500736802000000060803 00fb8002070201010107040705fb00010201fb2c01",
+        "06007368020000000907030196000103010101000007fb800203010100c80000000000009061c003fb8002",
         "070073680200000009010102",
     ];
     for (bytes, recorded) in all().iter().zip(recorded) {

@@ -151,11 +151,7 @@ impl RunClient {
         // A launcher that does not answer at all is noticed sooner this way.
         match self.status()? {
             None => bail!("{}", self.not_running()),
-            Some(status) if is_in_final_evaluation(&status) => bail!(
-                "the training in {} is finished, and its final evaluation is under way; Ctrl-C in its terminal or \
-                 SIGTERM ends that",
-                self.run.path().display()
-            ),
+            Some(status) if is_in_final_evaluation(&status) => bail!("{}", in_final_evaluation(&self.run)),
             Some(_) => {}
         }
         let answer = self.ask(ControlRequest::Stop, STOP_PATIENCE)?;
@@ -192,6 +188,15 @@ impl RunClient {
 pub fn is_in_final_evaluation(status: &RunStatus) -> bool {
     let waiting = status.waiting.clone().map(OutcomeReason::from);
     waiting == Some(OutcomeReason::FinalEvaluation)
+}
+
+/// Why a run cannot be stopped any more.
+pub fn in_final_evaluation(run: &RunDir) -> String {
+    format!(
+        "the training in {} is finished, and its final evaluation is under way; Ctrl-C in its terminal or SIGTERM ends \
+         that",
+        run.path().display()
+    )
 }
 
 fn accepted(answer: ControlResponse) -> anyhow::Result<()> {

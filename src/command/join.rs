@@ -20,7 +20,8 @@ pub(crate) struct JoinArgs {
     /// Actor processes on this host, each with its environment server.
     #[arg(long, value_name = "N", value_parser = parse_small_count, required_unless_present = "template")]
     pub(crate) actors: Option<u32>,
-    /// End, with exit code 4, if the run cannot be reached for this long, as in 90s, 10min or 2h.
+    /// End, with exit code 4, if the run cannot be reached, or does not admit this host again, for this long, as in 90s,
+    /// 10min or 2h.
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = parse_duration)]
     pub(crate) give_up: Duration,
     /// The host's name in `status` [default: the machine's].
@@ -80,7 +81,8 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
     };
     let time = number.parse::<u32>().ok().zip(seconds);
     time.map(|(number, seconds)| Duration::from_secs(u64::from(number) * seconds))
-        .ok_or_else(|| "write a number and a unit: 90s, 10min or 2h".into())
+        .filter(|time| !time.is_zero())
+        .ok_or_else(|| "write a number above 0 and a unit: 90s, 10min or 2h".into())
 }
 
 #[cfg(not(feature = "remote"))]
@@ -112,7 +114,7 @@ mod with_network {
     use shoal_run::usage::UsageError;
 
     use super::*;
-    use crate::launcher::joined::{self, JoinEnd};
+    use crate::launcher::joined::{self, JoinEnd, JoinEvents};
 
     /// The exit code if the run could not be reached, or did not admit the host again, for too long.
     const GAVE_UP: u8 = 4;
@@ -200,7 +202,7 @@ mod with_network {
             endpoint,
             key,
         };
-        let worked = work(args, host, (lease, connection), path, signals);
+        let worked = work(args, run, host, (lease, connection), path, signals);
         if args.local.is_none() {
             let log = RunDir::at(path).log();
             if worked.is_err() && log.exists() {
@@ -278,8 +280,10 @@ mod with_network {
         }
     }
 
+    /// Works for the run at `place`, an endpoint or a directory.
     fn work(
         args: &JoinArgs,
+        place: &str,
         host: JoiningHost,
         (lease, connection): (WireLease, GateConnection),
         path: &Path,
@@ -305,14 +309,18 @@ mod with_network {
             key.write(&run.path().join(KeyFile::JOIN))?;
         }
         HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&run)?;
-        if keeper.run_is_over() {
+        let has_heard = keeper.run_is_over();
+        if has_heard() {
             say("the run is over");
             return Ok(HostEnd::Exit(ExitCode::SUCCESS));
         }
         let actors = lease.actors.clone();
         say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
-        let on_relay_ready = Box::new(|| keeper.end());
-        let ending = joined::run(config, &run, signals, actors, args.give_up, on_relay_ready);
+        let events = JoinEvents {
+            on_relay_ready: Box::new(|| keeper.end()),
+            run_is_over: Box::new(|| has_heard() || is_finished(place)),
+        };
+        let ending = joined::run(config, &run, signals, actors, args.give_up, events);
         if args.local.is_none() && ending.is_err() {
             // While this process has the lock, so that no other one takes the directory for an abandoned one.
             keep_log(&run);
@@ -432,7 +440,7 @@ mod tests {
         assert_eq!(parse_duration("90s"), Ok(Duration::from_secs(90)));
         assert_eq!(parse_duration("10min"), Ok(Duration::from_secs(600)));
         assert_eq!(parse_duration("2h"), Ok(Duration::from_secs(7200)));
-        for wrong in ["", "10", "s", "-1s", "1.5h", "1d", "99999999999s"] {
+        for wrong in ["", "0s", "10", "s", "-1s", "1.5h", "1d", "99999999999s"] {
             assert!(parse_duration(wrong).is_err(), "{wrong}");
         }
     }

@@ -41,21 +41,28 @@ pub(crate) enum JoinEnd {
     Interrupted(i32),
 }
 
-/// Works for the run until one of these endings. `config` and `run` are those of this host. `on_relay_ready` is
-/// called after the relay's first heartbeat. If there is none, it is dropped without being called.
+/// What a joined host does when its relay starts, and how it learns what the relay cannot hear.
+pub(crate) struct JoinEvents<'a> {
+    /// Called after the relay's first heartbeat. If there is none, it is dropped without being called.
+    pub(crate) on_relay_ready: Box<dyn FnOnce() + 'a>,
+    /// Asked whether the run is over while the relay has no connection.
+    pub(crate) run_is_over: Box<dyn Fn() -> bool + 'a>,
+}
+
+/// Works for the run until one of these endings. `config` and `run` are those of this host.
 pub(crate) fn run(
     config: Config,
     run: &LockedRun,
     signals: &Signals,
     actors: Vec<u32>,
     give_up: Duration,
-    on_relay_ready: Box<dyn FnOnce()>,
+    events: JoinEvents<'_>,
 ) -> anyhow::Result<JoinEnd> {
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
         .and_then(|()| JoinedLauncher::new(config, run, &domain, signals, actors))
-        .and_then(|launcher| launcher.run(give_up, on_relay_ready));
+        .and_then(|launcher| launcher.run(give_up, events));
     // Also after an error: no role is left by now.
     let left = domain.leave();
     let ending = ending?;
@@ -108,11 +115,15 @@ impl<'a> JoinedLauncher<'a> {
         })
     }
 
-    fn run(mut self, give_up: Duration, on_relay_ready: Box<dyn FnOnce()>) -> anyhow::Result<JoinEnd> {
+    fn run(mut self, give_up: Duration, events: JoinEvents<'_>) -> anyhow::Result<JoinEnd> {
+        let JoinEvents {
+            on_relay_ready,
+            run_is_over,
+        } = events;
         // Kept until the end of this function: dropping it gives the host's actors back, and a relay that starts
         // meanwhile still needs them.
         let mut on_relay_ready = Some(on_relay_ready);
-        let ending = self.watch(give_up, &mut on_relay_ready);
+        let ending = self.watch(give_up, &mut on_relay_ready, &run_is_over);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
@@ -140,7 +151,12 @@ impl<'a> JoinedLauncher<'a> {
         ending
     }
 
-    fn watch(&mut self, give_up: Duration, on_relay_ready: &mut Option<Box<dyn FnOnce()>>) -> anyhow::Result<JoinEnd> {
+    fn watch(
+        &mut self,
+        give_up: Duration,
+        on_relay_ready: &mut Option<Box<dyn FnOnce() + '_>>,
+        run_is_over: &dyn Fn() -> bool,
+    ) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received()
@@ -184,6 +200,7 @@ impl<'a> JoinedLauncher<'a> {
             match activity {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
                 Some(Activity::Working) => self.cut_off_since = None,
+                _ if run_is_over() => return Ok(JoinEnd::Over),
                 _ => {
                     let since = self.cut_off_since.get_or_insert_with(Instant::now);
                     if since.elapsed() >= give_up && self.end_request.is_none() {

@@ -767,6 +767,72 @@ fn the_directory_of_a_killed_host_is_removed_and_the_log_of_a_failed_one_is_kept
 }
 
 #[test]
+fn a_host_whose_run_ends_while_its_relay_starts_ends_too() {
+    for _ in 0..10 {
+        let run = Run::start(&["--actors", "1"]);
+        let place = Workplace::new();
+        let join = ["join", &run.endpoint(), "--actors", "1", "--local", "host"];
+        let mut host = place.shoal(&join).stdin(Stdio::null()).spawn().unwrap();
+        let log = || std::fs::read_to_string(place.path().join("host/shoal.log")).unwrap_or_default();
+        let (mut relay, begun) = (None, Instant::now());
+        while relay.is_none() && begun.elapsed() < Duration::from_secs(60) {
+            let log = log();
+            let started = log
+                .lines()
+                .find_map(|line| line.split_once("relay-0 started as process "));
+            relay = started.map(|(_, pid)| Pid::from_raw(pid.trim().parse().unwrap()).unwrap());
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let relay = relay.unwrap();
+        kill_process(relay, Signal::STOP).unwrap();
+        let is_late = log().contains("relay-0 ready after");
+        if !is_late {
+            stop(run);
+        }
+        // The run has ended, and nobody answers the relay.
+        kill_process(relay, Signal::CONT).unwrap();
+        if is_late {
+            stop(run);
+        }
+        until("the host has ended", || host.try_wait().unwrap().is_some());
+        assert_eq!(host.wait().unwrap().code(), Some(0));
+        if !is_late {
+            return;
+        }
+    }
+    panic!("the relay was ready each time before it was stopped");
+}
+
+#[test]
+fn the_actors_of_a_host_that_vanishes_are_free_although_the_gate_dies_again_and_again() {
+    let run = Run::start(&["--actors", "1", "--set", "remote.lost_seconds=5"]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    host.running.kill_all();
+    until("the host has lost its actors", || {
+        run.running.kill_if_alive("gate-0");
+        std::thread::sleep(Duration::from_secs(2));
+        run.running.log().contains("its actors are free")
+    });
+    stop(run);
+}
+
+#[test]
+fn in_lockstep_a_stopped_actor_of_another_host_is_waited_for() {
+    let run = Run::start(&["--lockstep", "--actors", "2", "--set", "run.stall_seconds=6"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[0, 1]);
+    host.running.stop_role("actor-1");
+    std::thread::sleep(Duration::from_secs(12));
+    host.running.continue_role("actor-1");
+    wait_for_actors(&run, &[0, 1]);
+    let log = run.running.log();
+    assert!(!log.contains("makes no progress"), "{log}");
+    stop(run);
+    host.ends_with(0);
+}
+
+#[test]
 fn the_actors_of_a_host_that_vanishes_are_free_after_a_while() {
     let run = Run::start(&[
         "--actors",

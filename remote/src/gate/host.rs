@@ -10,7 +10,7 @@ use zenoh::query::Query;
 
 use super::policies::PolicyId;
 use crate::network::CUT_OFF_AFTER;
-use crate::wire::{ActorAcknowledgement, HostReport};
+use crate::wire::{ActorAcknowledgement, HostReport, ReportNumber};
 
 /// A host that is admitted.
 pub(super) struct Host {
@@ -20,9 +20,12 @@ pub(super) struct Host {
     pub(super) acknowledged_at: Instant,
     /// An acknowledgement is sent soon, whether anything has changed or not.
     pub(super) acknowledgement_due: bool,
+    /// When it was last heard of, or admitted.
     pub(super) heard_at: Instant,
+    /// Whether this gate has heard of it. An earlier gate, or nobody, may have admitted it.
+    pub(super) is_known: bool,
     /// The number of its last report.
-    pub(super) last_report: u64,
+    pub(super) last_report: ReportNumber,
     pub(super) has_left: bool,
     pub(super) newest_report: Option<HostReport>,
     pub(super) warned_at: Option<Instant>,
@@ -38,11 +41,12 @@ pub(super) struct Host {
 }
 
 impl Host {
-    /// Whether it may be the reason why a lockstep run makes no progress: it is cut off, or one of its processes is at
-    /// work.
+    /// Whether it may be the reason why a lockstep run makes no progress: it is cut off, or not each of its actors and
+    /// environment servers waits.
     pub(super) fn is_awaited(&self) -> bool {
-        let mut roles = self.newest_report.iter().flat_map(|report| &report.roles);
-        self.heard_at.elapsed() >= CUT_OFF_AFTER || roles.any(|role| role.activity == Activity::Working)
+        let roles = self.newest_report.iter().flat_map(|report| &report.roles);
+        let waiting = roles.filter(|role| role.activity != Activity::Working).count();
+        self.heard_at.elapsed() >= CUT_OFF_AFTER || waiting < 2 * self.lease.actors.len()
     }
 
     /// Its status, when the newest policy has this version. Rates are those since the last call.
@@ -54,7 +58,7 @@ impl Host {
         }
         self.rows_at_last_status = (Instant::now(), self.forwarded_rows);
         let silent = self.heard_at.elapsed();
-        let cut_off = silent >= CUT_OFF_AFTER;
+        let cut_off = !self.is_known || silent >= CUT_OFF_AFTER;
         let mut roles = Vec::new();
         for role in self.newest_report.iter().flat_map(|report| &report.roles) {
             let key = (role.role, role.index);
