@@ -203,7 +203,7 @@ fn run_once(
     starts.write(run)?;
     wait_for_predecessors(&config.run.id, run)?;
     Domain::remove_abandoned()?;
-    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let domain = Domain::join(&config.run.id, config.actors.max_on_a_host())?;
     let outcome = preflight::reserve(&config, run, &domain)
         .and_then(|()| Launcher::new(config, run, &domain, signals, options))
         .and_then(Launcher::run);
@@ -294,7 +294,7 @@ impl<'a> Launcher<'a> {
         // Creates the services that are opened below.
         let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::OfLearner { gate })?;
         Ok(Self {
-            control: ControlPort::open(domain)?,
+            control: ControlPort::open(domain, config.actors.max)?,
             initial,
             end_request: None,
             phase: Phase::AtWork,

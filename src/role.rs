@@ -74,7 +74,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         return external_environment::serve_with(&program);
     }
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
-    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let domain = Domain::join(&config.run.id, config.actors.max_on_a_host())?;
     let ended = work(&domain, &config, &run, instance, &stop);
     let left = domain.leave();
     ended?;

@@ -90,7 +90,7 @@ fn resume_changes_nothing_before_the_last_role_of_a_killed_launcher_has_ended() 
     // This process stands for a role that does not end. A stopped one would not do: the system continues it when its
     // launcher dies.
     let config = Config::load(&run.join("config.toml")).unwrap();
-    let role = Domain::join(&config.run.id, config.actors.max).unwrap();
+    let role = Domain::join(&config.run.id, config.actors.max_on_a_host()).unwrap();
     running.kill_all();
 
     let steps = (rows(&run) + 500).to_string();

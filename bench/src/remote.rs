@@ -9,7 +9,7 @@ mod usage;
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
-use shoal_common::config::RemoteConfig;
+use shoal_common::config::{ActorsConfig, RemoteConfig};
 
 use self::cable::Cable;
 use self::hosts::{Network, RemoteRun};
@@ -53,8 +53,9 @@ const POLICY_BYTES: f64 = 488_804.0;
 /// Policies that a learner publishes a second: every fourth of 600 gradient steps makes one.
 const PUBLISHED_PER_SECOND: f64 = 150.0;
 
-/// Hosts that join one gate, and the actors of each.
+/// Hosts that join one gate, and the actors of each: as many as have services of their own, and as many as share one.
 const MANY_HOSTS: (u32, u32) = (32, 8);
+const MOST_HOSTS: (u32, u32) = (32, 32);
 
 /// Hosts and actors of each for which the model alone is asked.
 const MODELLED_HOSTS: (u32, u32) = (32, 32);
@@ -66,9 +67,9 @@ const OUTAGE_STEP: Duration = Duration::from_millis(700);
 /// How long rows may take to come back.
 const RETURN_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Shares of the time: each of the rates, the outages, the many hosts, and each rate that the model predicts. A tenth
+/// Shares of the time: each of the rates, the outages, each number of many hosts, and each rate that the model predicts. A tenth
 /// of each warms up.
-const SHARES: [f64; 4] = [0.2, 0.2, 0.2, 0.15];
+const SHARES: [f64; 4] = [0.2, 0.2, 0.1, 0.15];
 const WARM_UP: f64 = 0.1;
 
 /// The fields of `bench remote --json`.
@@ -85,6 +86,7 @@ pub(super) struct RemoteFigures {
     gigabit: Option<LinkFigures>,
     outages: Option<OutageFigures>,
     many: ManyFigures,
+    most: ManyFigures,
     /// What a queueing model predicts, beside measurements.
     model: Option<ModelFigures>,
     /// Why there is no virtual cable.
@@ -163,7 +165,8 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
         cable: None,
         gigabit: None,
         outages: None,
-        many: measure_many_hosts(many, budget)?,
+        many: measure_many_hosts(MANY_HOSTS, many, budget)?,
+        most: measure_many_hosts(MOST_HOSTS, many, budget)?,
         model: None,
         no_cable: None,
     };
@@ -340,10 +343,19 @@ fn chunks_per_second_at_pace(
 }
 
 /// Many hosts at one gate, which is killed once.
-fn measure_many_hosts(length: Duration, budget: &TimeBudget) -> anyhow::Result<ManyFigures> {
-    let (hosts, actors) = MANY_HOSTS;
-    let temporary = temporary_run(hosts * actors, DEFAULT_WINDOW)?;
-    RemoteRun::with(&temporary, &Network::Loopback, MANY_HOSTS, budget, |run| {
+fn measure_many_hosts(
+    (hosts, actors): (u32, u32),
+    length: Duration,
+    budget: &TimeBudget,
+) -> anyhow::Result<ManyFigures> {
+    let with_own_service = hosts * actors <= ActorsConfig::MAX_ON_A_HOST;
+    let first = if with_own_service {
+        0
+    } else {
+        ActorsConfig::MAX_ON_A_HOST
+    };
+    let temporary = temporary_run(first + hosts * actors, DEFAULT_WINDOW)?;
+    RemoteRun::with(&temporary, &Network::Loopback, (hosts, actors), budget, |run| {
         run.send_for(length.mul_f64(WARM_UP))?;
         let (begun, before) = (Instant::now(), run.rows_of_hosts());
         run.send_for(length.mul_f64(1.0 - WARM_UP))?;
@@ -413,6 +425,28 @@ impl ModelFigures {
     }
 }
 
+impl ManyFigures {
+    fn show(&self) -> String {
+        format!(
+            "{} with {} actors: {:.2} million rows a second, the slowest has {:.2} of the fastest",
+            self.hosts,
+            self.actors,
+            self.rows_per_second / 1e6,
+            self.fairness
+        )
+    }
+
+    fn show_gate(&self) -> String {
+        format!(
+            "{} open files, {:.1} MB private, {:.1} MB of shared memory; killed, rows of all hosts again after {:.2} s",
+            self.gate_open_files,
+            self.gate_private_bytes as f64 / 1e6,
+            self.gate_shared_memory_bytes as f64 / 1e6,
+            self.rejoined_s
+        )
+    }
+}
+
 impl LinkFigures {
     fn show(&self) -> String {
         format!(
@@ -428,7 +462,6 @@ impl Figures for RemoteFigures {
     fn lines(&self) -> Vec<(&'static str, String)> {
         let none = || self.no_cable.clone().unwrap_or_default();
         let link = |link: &Option<LinkFigures>| link.as_ref().map_or_else(none, LinkFigures::show);
-        let many = &self.many;
         vec![
             ("one host, loopback, unencrypted", self.loopback.show()),
             ("one host, virtual cable, encrypted", link(&self.cable)),
@@ -450,26 +483,10 @@ impl Figures for RemoteFigures {
                     format!("{median_s:.2} s, at worst {longest_s:.2} (of {count})")
                 }),
             ),
-            (
-                "many hosts",
-                format!(
-                    "{} with {} actors: {:.2} million rows a second, the slowest has {:.2} of the fastest",
-                    many.hosts,
-                    many.actors,
-                    many.rows_per_second / 1e6,
-                    many.fairness
-                ),
-            ),
-            (
-                "their gate",
-                format!(
-                    "{} open files, {:.1} MB private, {:.1} MB of shared memory; killed, rows of all hosts again after {:.2} s",
-                    many.gate_open_files,
-                    many.gate_private_bytes as f64 / 1e6,
-                    many.gate_shared_memory_bytes as f64 / 1e6,
-                    many.rejoined_s
-                ),
-            ),
+            ("many hosts", self.many.show()),
+            ("their gate", self.many.show_gate()),
+            ("1,024 actors", self.most.show()),
+            ("their gate", self.most.show_gate()),
             (
                 "actors over 100 Mbit/s (expected)",
                 self.model.as_ref().map_or_else(none, ModelFigures::show_rows),

@@ -141,7 +141,7 @@ impl TemporaryRun {
     /// Calls `act` as a member of the run. Leaves nothing of the run in shared memory.
     pub(super) fn in_shared_memory<T>(&self, act: impl FnOnce(&Domain) -> anyhow::Result<T>) -> anyhow::Result<T> {
         Domain::remove_abandoned()?;
-        let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
+        let domain = Domain::join(&self.config.run.id, self.config.actors.max_on_a_host())?;
         let acted = self.services(&domain).and_then(|_services| act(&domain));
         let left = domain.leave();
         let acted = acted?;

@@ -189,6 +189,14 @@ impl Config {
         self.actors.max
     }
 
+    /// How many actors share a service for their transitions.
+    pub fn actors_that_share(&self) -> u32 {
+        match self.run.mode {
+            Mode::Free => self.actors.max - self.actors.max_on_a_host(),
+            Mode::Lockstep => 0,
+        }
+    }
+
     /// Environments that the evaluator steps at once.
     pub fn evaluation_envs(&self) -> u32 {
         self.evaluation.episodes.min(self.evaluation.envs)

@@ -118,7 +118,7 @@ enum Arrival {
 /// An actor of another host.
 struct RemoteActor {
     host: u64,
-    /// `None` while the actor that the learner's host had before is ending.
+    /// `None` while the actor that the learner's host had before is ending, and for one that shares a service.
     forwarder: Option<ChunkForwarder>,
     forwarding: Forwarding,
 }
@@ -140,6 +140,8 @@ struct Gate<'a> {
     epoch: Option<u64>,
     hosts: HashMap<u64, Host>,
     actors: HashMap<u32, RemoteActor>,
+    /// Of all actors that share a service; `None` while there are none, or an earlier gate's port is not freed.
+    shared_forwarder: Option<ChunkForwarder>,
     replay: CommitReader,
     policies: Policies,
     learner_notifier: Notifier,
@@ -189,7 +191,7 @@ impl<'a> Gate<'a> {
         };
         let layout = config.policy_layout()?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        let requests = LauncherRequests::start(&config.run.id, config.actors.max, run.directory_id()?)?;
+        let requests = LauncherRequests::start(&config.run.id, config.actors.max_on_a_host(), run.directory_id()?)?;
         let session = network::listen(&settings.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
         declare(&session, &config.run.id, &sender)?;
@@ -205,6 +207,7 @@ impl<'a> Gate<'a> {
             epoch: None,
             hosts: HashMap::new(),
             actors: HashMap::new(),
+            shared_forwarder: None,
             replay,
             policies: Policies::new(policy, config.remote.policy_bandwidth),
             learner_notifier: Notifier::new(domain, EventName(Role::Learner, 0))?,
@@ -300,7 +303,13 @@ impl<'a> Gate<'a> {
         // Processes of a host that was admitted again may have incarnations of an earlier lease.
         let ours = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
-        let Some(forwarder) = &actor.forwarder else {
+        let shares = chunk.header.actor >= self.settings.config.actors.max_on_a_host();
+        let forwarder = if shares {
+            &self.shared_forwarder
+        } else {
+            &actor.forwarder
+        };
+        let Some(forwarder) = forwarder else {
             return Ok(0);
         };
         let parts = forwarder.parts(&chunk.header, &chunk.numbers);
@@ -340,7 +349,9 @@ impl<'a> Gate<'a> {
         host.acknowledgement_due = true;
         host.has_left = report.leaving;
         for role in &report.roles {
-            if role.role == Role::Actor && host.lease.actors.contains(&role.index) {
+            // The learner then opens the actor's own service.
+            let has_own_service = role.index < self.settings.config.actors.max_on_a_host();
+            if role.role == Role::Actor && has_own_service && host.lease.actors.contains(&role.index) {
                 self.heartbeats.send(role.heartbeat());
             }
         }
@@ -509,10 +520,17 @@ impl<'a> Gate<'a> {
     fn open_forwarders(&mut self) -> Result<(), GateError> {
         let config = &self.settings.config;
         let (layout, window) = (config.chunk_layout(), config.actors.window);
+        let mut any_shares = false;
         for (index, actor) in &mut self.actors {
-            if actor.forwarder.is_none() {
+            if *index >= config.actors.max_on_a_host() {
+                any_shares = true;
+            } else if actor.forwarder.is_none() {
                 actor.forwarder = ChunkForwarder::try_open(self.domain, *index, layout, window)?;
             }
+        }
+        if any_shares && self.shared_forwarder.is_none() {
+            let actors = config.actors_that_share();
+            self.shared_forwarder = ChunkForwarder::try_open_shared(self.domain, actors, layout, window)?;
         }
         Ok(())
     }
@@ -667,7 +685,8 @@ impl<'a> Gate<'a> {
             true => Activity::WaitingForRatio,
             false => Activity::WaitingForPeer,
         });
-        let mut forwarders = self.actors.values().filter_map(|actor| actor.forwarder.as_ref());
+        let own = self.actors.values().filter_map(|actor| actor.forwarder.as_ref());
+        let mut forwarders = own.chain(&self.shared_forwarder);
         forwarders.try_for_each(ChunkForwarder::refresh_connections)?;
         self.open_forwarders()
     }

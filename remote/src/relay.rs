@@ -239,7 +239,7 @@ impl<'a> Relay<'a> {
         let now = Instant::now();
         Ok(Self {
             chunk_queue: start_sending(&session, host)?,
-            requests: LauncherRequests::start(&config.run.id, config.actors.max, run.directory_id()?)
+            requests: LauncherRequests::start(&config.run.id, config.actors.max_on_a_host(), run.directory_id()?)
                 .map_err(refused("start a thread"))?,
             heartbeat_reports: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,

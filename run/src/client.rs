@@ -46,7 +46,7 @@ impl RunClient {
         if !self.run.is_running()? {
             return Ok(None);
         }
-        let domain = Domain::visit(&self.config.run.id, self.config.actors.max)?;
+        let domain = Domain::visit(&self.config.run.id, self.config.actors.max_on_a_host())?;
         let answer = self.ask_in(&domain, request, patience);
         let left = domain.leave();
         let answer = answer?;

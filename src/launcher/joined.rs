@@ -59,7 +59,7 @@ pub(crate) fn run(
     events: JoinEvents<'_>,
 ) -> anyhow::Result<JoinEnd> {
     Domain::remove_abandoned()?;
-    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let domain = Domain::join(&config.run.id, config.actors.max_on_a_host())?;
     let ending = preflight::reserve_for_host(&config, &domain)
         .and_then(|()| JoinedLauncher::new(config, run, &domain, signals, actors))
         .and_then(|launcher| launcher.run(give_up, events));
@@ -100,7 +100,7 @@ impl<'a> JoinedLauncher<'a> {
         // Creates the services that are opened below.
         let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::Joined { actors })?;
         Ok(Self {
-            control: ControlPort::open(domain)?,
+            control: ControlPort::open(domain, config.actors.max)?,
             heartbeats: Reports::open(domain)?,
             stalls: StallDetector::of_joined_host(Duration::from_secs(config.run.stall_seconds)),
             supervisor,

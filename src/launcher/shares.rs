@@ -1,6 +1,7 @@
 //! How many actors each host gets.
 
 use shoal_common::channel::control::ScaleRequest;
+use shoal_common::config::ActorsConfig;
 
 /// A host that has actors.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,6 +53,10 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
     };
     if shares.contains(&0) {
         return Err("a host has at least 1 actor; to free it altogether, end its `shoal join`".into());
+    }
+    let most = ActorsConfig::MAX_ON_A_HOST;
+    if shares.iter().any(|share| *share > most) {
+        return Err(format!("a host has at most {most} actors"));
     }
     let sum: u64 = shares.iter().map(|share| u64::from(*share)).sum();
     if sum <= u64::from(max_actors) {

@@ -87,6 +87,8 @@ pub(super) struct Supervisor {
     actors_to_take: usize,
     /// The most actors that the run may have on all hosts.
     max_actors: u32,
+    /// The most actors that this host may have. Their indices are below this number.
+    max_actors_here: u32,
     /// The number of actors of a lockstep run, on all hosts together. It never changes.
     lockstep_actors: Option<u32>,
     joined_hosts: JoinedHosts,
@@ -132,12 +134,15 @@ impl Supervisor {
                 &format!("{} is missing or wrong; counting from {started}", counter.display()),
             );
         }
+        let is_learner_host = matches!(host, SupervisedHost::OfLearner { .. });
         let mut services = Services::new(domain)?;
         services.create_common(domain)?;
+        if is_learner_host && config.actors_that_share() > 0 {
+            services.create_shared_transitions(domain, config.actors_that_share(), config.actors.window)?;
+        }
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
-        let is_learner_host = matches!(host, SupervisedHost::OfLearner { .. });
         let (children, actors) = match host {
             SupervisedHost::OfLearner { gate } => {
                 services.create_environment(domain, server)?;
@@ -164,6 +169,7 @@ impl Supervisor {
             actors_to_take: 0,
             joined_hosts: JoinedHosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
+            max_actors_here: config.actors.max_on_a_host(),
             lockstep_actors,
             log,
             incidents: Vec::new(),

@@ -213,6 +213,40 @@ fn scale_changes_the_actors_of_joined_hosts_without_losing_a_row() {
     assert_eq!(in_replay(&path, &all), everywhere);
 }
 
+#[test]
+fn actors_that_share_a_service_lose_no_row_when_gate_and_learner_are_killed() {
+    // The learner's host can have the first 256 of them.
+    let run = Run::start(&[
+        "--actors",
+        "1",
+        "--set",
+        "actors.max=260",
+        "--set",
+        "replay.updates_per_step=0.2",
+        "--set",
+        "replay.capacity=500000",
+    ]);
+    let host = Host::join(&run, &["--actors", "3"]);
+    let actors = [256, 257, 258];
+    wait_for_actors(&run, &actors);
+    for _ in 0..4 {
+        run.running.kill("gate-0");
+        wait_for_actors(&run, &actors);
+        run.running.kill("learner-0");
+        wait_for_actors(&run, &actors);
+        host.running.kill("relay-0");
+        wait_for_actors(&run, &actors);
+    }
+    // There is one left that shares the service, so the second has one of its own.
+    let second = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[0, 1, 256, 257, 258, 259]);
+    let path = stop(run);
+    let sent = host.sent(&actors) + second.sent(&[1, 259]);
+    host.ends_with(0);
+    second.ends_with(0);
+    assert_eq!(in_replay(&path, &[1, 256, 257, 258, 259]), sent);
+}
+
 /// Two hosts join a run. Roles of all three hosts are killed, or stopped for a while, at random for this long. Every row
 /// that the actors of the two have sent must be committed once. These actors are spared: one that is killed may take a
 /// chunk with it that it has not logged.
@@ -786,13 +820,13 @@ fn a_host_whose_run_ends_while_its_relay_starts_ends_too() {
         let relay = relay.unwrap();
         kill_process(relay, Signal::STOP).unwrap();
         let is_late = log().contains("relay-0 ready after");
-        if !is_late {
-            stop(run);
-        }
-        // The run has ended, and nobody answers the relay.
-        kill_process(relay, Signal::CONT).unwrap();
         if is_late {
+            kill_process(relay, Signal::CONT).unwrap();
             stop(run);
+        } else {
+            stop(run);
+            // Now nobody answers it.
+            kill_process(relay, Signal::CONT).unwrap();
         }
         until("the host has ended", || host.try_wait().unwrap().is_some());
         assert_eq!(host.wait().unwrap().code(), Some(0));

@@ -176,11 +176,13 @@ impl<'a> RemoteRun<'a> {
         let Keys { gate, join } = &keys;
         gate.write(&run.path().join(KeyFile::GATE))?;
         join.write(&run.path().join(KeyFile::JOIN))?;
+        // All have services of their own, or all share one.
+        let first = config.actors.max - hosts * actors;
         let lease = |host: u32| HostLease {
             host: u64::from(host) + 1,
             name: format!("host-{host}"),
             epoch: 1,
-            actors: (host * actors..(host + 1) * actors).collect(),
+            actors: (first + host * actors..first + (host + 1) * actors).collect(),
             wanted_actors: actors,
             cores: 1,
             first_incarnation: (u64::from(host) + 1) * HostLease::INCARNATIONS,
@@ -188,8 +190,12 @@ impl<'a> RemoteRun<'a> {
         };
         let mut services = Services::new(domain)?;
         // Those of the run's own actors exist.
-        for actor in config.actors.count..hosts * actors {
-            services.create_transitions(domain, actor, config.actors.window)?;
+        if config.actors_that_share() > 0 {
+            services.create_shared_transitions(domain, config.actors_that_share(), config.actors.window)?;
+        } else {
+            for actor in config.actors.count..hosts * actors {
+                services.create_transitions(domain, actor, config.actors.window)?;
+            }
         }
         let mut rows = Rows::new(config)?;
         let mut chunks = vec![vec![0.0; ENVIRONMENTS * config.row_layout().width()]; CHUNKS];
@@ -201,13 +207,13 @@ impl<'a> RemoteRun<'a> {
         })?;
         let last_actor = RoleInstance {
             role: Role::Actor,
-            index: hosts * actors - 1,
+            index: if first == 0 { hosts * actors - 1 } else { 0 },
             incarnation: 1,
         };
         Ok(Self {
             launcher: Launcher {
                 run,
-                control: ControlPort::open(domain)?,
+                control: ControlPort::open(domain, config.actors.max)?,
                 leases: (0..hosts).map(lease).collect(),
                 heartbeat: HeartbeatSender::new(domain, last_actor)?,
             },
@@ -394,7 +400,7 @@ impl JoinedHost {
         let endpoint = JoinFile::read(run.temporary.run.path())?.endpoint;
         key.write(&directory.path().join(KeyFile::JOIN))?;
         HostFile::new(endpoint, key.run_id.clone(), (lease.host, lease.name.clone()), &wire).write(&directory)?;
-        let domain = Domain::join(&config.run.id, config.actors.max)?;
+        let domain = Domain::join(&config.run.id, config.actors.max_on_a_host())?;
         let mut services = Services::new(&domain)?;
         services.create_common(&domain)?;
         for actor in &lease.actors {

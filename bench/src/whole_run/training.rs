@@ -239,7 +239,7 @@ impl Training {
 impl Observer {
     fn open(run: &RunDir) -> anyhow::Result<Self> {
         let client = RunClient::open(run.path())?;
-        let domain = Domain::join(&client.config.run.id, client.config.actors.max)?;
+        let domain = Domain::join(&client.config.run.id, client.config.actors.max_on_a_host())?;
         Ok(Self {
             heartbeats: Reports::open(&domain)?,
             policies: policy_reader(&client.config, &domain)?,

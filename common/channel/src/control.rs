@@ -104,15 +104,15 @@ impl AsFd for ControlPort {
 }
 
 impl ControlPort {
-    /// Opens the launcher's end.
+    /// Opens the launcher's end, for a run of up to `max_actors` actors on all hosts.
     ///
     /// # Errors
     /// When shared memory is unavailable.
-    pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
+    pub fn open(domain: &Domain, max_actors: u32) -> Result<Self, ChannelError> {
         let server = claim(|| {
             service(domain, OpenMode::Open)?
                 .server_builder()
-                .initial_max_slice_len(response_length(domain.max_actors()))
+                .initial_max_slice_len(response_length(max_actors as usize))
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "answer", cause))
         })?;
@@ -335,7 +335,7 @@ mod tests {
         let domain = Domain::join(&run_id, 1).unwrap();
         let mut services = Services::new(&domain).unwrap();
         services.create_common(&domain).unwrap();
-        let mut port = ControlPort::open(&domain).unwrap();
+        let mut port = ControlPort::open(&domain, 1).unwrap();
         let run = RunDirId { device: 1, inode: 2 };
         let a_minute = Timespec { tv_sec: 60, tv_nsec: 0 };
         std::thread::scope(|scope| {

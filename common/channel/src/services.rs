@@ -95,6 +95,15 @@ impl Services {
         Ok(())
     }
 
+    /// Creates the service for the transitions of `actors` actors that have none of their own.
+    ///
+    /// # Errors
+    /// As [`create_common`](Self::create_common).
+    pub fn create_shared_transitions(&mut self, domain: &Domain, actors: u32, window: u32) -> Result<(), ChannelError> {
+        self.held.push(transitions::create_shared(domain, actors, window)?);
+        Ok(())
+    }
+
     /// Creates the event service of one role alone.
     ///
     /// # Errors

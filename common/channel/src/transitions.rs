@@ -1,5 +1,8 @@
 //! Transitions, from one actor to the learner, in chunks of rows.
 //!
+//! Most actors have a service of their own. Those of joined hosts beyond the first few hundred share one: there, the
+//! gate sends the chunks of all of them, and the learner commits them in the same order.
+//!
 //! An actor has at most `window` chunks sent but not committed. The service's history holds as many, and the learner's
 //! buffer twice as many, because a new learner may receive a whole history that was committed before and a whole window
 //! on top. So `send` never runs out of space, and chunks that a dead learner had not committed reach the next one.
@@ -246,7 +249,28 @@ impl ChunkForwarder {
         layout: ChunkLayout,
         window: u32,
     ) -> Result<Option<Self>, ChannelError> {
-        let channel = name(actor);
+        Self::try_open_channel(domain, name(actor), layout, window)
+    }
+
+    /// As [`try_open`](Self::try_open), for the service that `actors` actors share.
+    ///
+    /// # Errors
+    /// As [`try_open`](Self::try_open).
+    pub fn try_open_shared(
+        domain: &Domain,
+        actors: u32,
+        layout: ChunkLayout,
+        window: u32,
+    ) -> Result<Option<Self>, ChannelError> {
+        Self::try_open_channel(domain, SHARED.into(), layout, actors * window)
+    }
+
+    fn try_open_channel(
+        domain: &Domain,
+        channel: String,
+        layout: ChunkLayout,
+        window: u32,
+    ) -> Result<Option<Self>, ChannelError> {
         let opened = service(domain, &channel, window, OpenMode::Open);
         match opened.and_then(|service| publisher(&service, &channel, &layout)) {
             Ok(publisher) => Ok(Some(Self {
@@ -354,7 +378,18 @@ impl ChunkReceiver {
     /// # Errors
     /// When shared memory is unavailable, or another learner is still alive.
     pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
-        let channel = name(actor);
+        Self::open_channel(domain, name(actor), layout, window)
+    }
+
+    /// As [`open`](Self::open), for the service that `actors` actors share.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_shared(domain: &Domain, actors: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
+        Self::open_channel(domain, SHARED.into(), layout, actors * window)
+    }
+
+    fn open_channel(domain: &Domain, channel: String, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let subscriber = claim(|| {
             service(domain, &channel, window, OpenMode::Open)?
                 .subscriber_builder()
@@ -437,13 +472,17 @@ impl ReceivedChunk {
     }
 }
 
-/// Bytes of shared memory that one actor's chunks of this layout reserve with this window.
+/// Bytes of shared memory that one actor's chunks of this layout reserve with this window; for a shared service, the
+/// window is the sum of all actors'.
 pub fn reserved(layout: &ChunkLayout, window: u32) -> u64 {
     let chunks = buffer(window) + BORROWED + window as usize + LOANED;
     memory::service(NODES)
         + memory::segment::<Header, ChunkHeader>(chunks, size_of::<f32>() * layout.len())
         + memory::connection(1, buffer(window), BORROWED, chunks)
 }
+
+/// The name of the service that actors share.
+const SHARED: &str = "transitions/shared";
 
 fn name(actor: u32) -> String {
     format!("transitions/{actor}")
@@ -455,7 +494,16 @@ fn buffer(window: u32) -> usize {
 
 /// Creates the service for the chunks of `actor`, of which at most `window` may be uncommitted.
 pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<HeldService, ChannelError> {
-    let service = service(domain, &name(actor), window, OpenMode::Create)?;
+    create_channel(domain, &name(actor), window)
+}
+
+/// Creates the service that `actors` actors share. Each may have `window` uncommitted chunks.
+pub(super) fn create_shared(domain: &Domain, actors: u32, window: u32) -> Result<HeldService, ChannelError> {
+    create_channel(domain, SHARED, actors * window)
+}
+
+fn create_channel(domain: &Domain, channel: &str, window: u32) -> Result<HeldService, ChannelError> {
+    let service = service(domain, channel, window, OpenMode::Create)?;
     Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));

@@ -7,7 +7,7 @@ section! {
     /// The actors, and the size of their chunks.
     #[derive(Eq)]
     pub struct ActorsConfig {
-        /// Actor processes, each with its own environment server; at most `actors.max`.
+        /// Actor processes, each with its own environment server; at most `actors.max`, and at most 256.
         count: u32 = 2, unit: "processes", source: "ours", change: in_free_runs("its results depend on it");
         /// Environments that an actor steps at once.
         envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours",
@@ -24,8 +24,17 @@ section! {
 }
 
 impl ActorsConfig {
+    /// The most actors on one host. Those with an index below this have a service of their own for their transitions on
+    /// the learner's host. All others are on joined hosts, and share one.
+    pub const MAX_ON_A_HOST: u32 = 256;
+
     /// The upper bound of `max`.
-    pub const MAX_ACTORS: u32 = 256;
+    pub const MAX_ACTORS: u32 = Self::MAX_ON_A_HOST + 1_024;
+
+    /// The most actors that one host may have.
+    pub fn max_on_a_host(&self) -> u32 {
+        self.max.min(Self::MAX_ON_A_HOST)
+    }
 
     /// Checks every number.
     ///
@@ -33,6 +42,6 @@ impl ActorsConfig {
     /// For the first invalid number.
     pub fn check(&self) -> Result<(), OutOfRange> {
         self.check_bounds("actors")?;
-        from(1, self.max).check("actors.count", &self.count)
+        from(1, self.max_on_a_host()).check("actors.count", &self.count)
     }
 }

@@ -38,6 +38,8 @@ pub enum IntakeError {
 #[derive(Debug)]
 pub struct Intake {
     actors: Vec<ActorChunks>,
+    /// Of the actors that share a service. They need no notification: the gate reads the commit record.
+    shared: Option<ChunkReceiver>,
     chunk: ChunkLayout,
     window: u32,
     /// The number of rows beyond which none are taken.
@@ -67,6 +69,7 @@ impl Intake {
     ) -> Result<Self, ChannelError> {
         let mut intake = Self {
             actors: Vec::new(),
+            shared: None,
             chunk,
             window,
             limit,
@@ -91,13 +94,22 @@ impl Intake {
         Ok(())
     }
 
-    /// The number of actors with an open receiver.
+    /// Opens the receiver of the service that `actors` actors share.
+    ///
+    /// # Errors
+    /// As `open`.
+    pub fn open_shared_receiver(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
+        self.shared = Some(ChunkReceiver::open_shared(domain, actors, self.chunk, self.window)?);
+        Ok(())
+    }
+
+    /// The number of actors with an open receiver of their own.
     pub fn actor_count(&self) -> usize {
         self.actors.len()
     }
 
     /// Takes one chunk of each actor in turn, until none is waiting, `most` of each were taken, or `enough` returns
-    /// true. Returns whether any chunk was taken.
+    /// true. Those that share a service count as one. Returns whether any chunk was taken.
     ///
     /// # Errors
     /// When a channel fails, or a chunk does not belong to this run.
@@ -107,18 +119,22 @@ impl Intake {
         most: u32,
         enough: impl Fn(&Replay) -> bool,
     ) -> Result<bool, IntakeError> {
-        let actors = self.actors.len();
+        let sources = self.actors.len() + usize::from(self.shared.is_some());
         let (mut any, mut idle) = (false, 0);
-        for _ in 0..u64::from(most) * actors as u64 {
-            if idle == actors || enough(replay) || replay.head() >= self.limit {
+        for _ in 0..u64::from(most) * sources as u64 {
+            if idle == sources || enough(replay) || replay.head() >= self.limit {
                 break;
             }
-            if self.take_from(self.turn, replay)?.is_some() {
+            let taken = match self.actors.get(self.turn) {
+                Some(_) => self.take_from(self.turn, replay)?,
+                None => self.take_shared(replay)?,
+            };
+            if taken.is_some() {
                 (any, idle) = (true, 0);
             } else {
                 idle += 1;
             }
-            self.turn = (self.turn + 1) % actors;
+            self.turn = (self.turn + 1) % sources;
         }
         Ok(any)
     }
@@ -132,12 +148,24 @@ impl Intake {
         let Some(chunk) = source.receiver.receive()? else {
             return Ok(None);
         };
-        let accepted =
-            self.limit.saturating_sub(replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
-        let appended = append(replay, actor, &chunk, accepted)?;
+        let appended = self.append(replay, actor, &chunk)?;
         drop(chunk);
         source.notifier.notify();
         Ok(Some(appended))
+    }
+
+    fn take_shared(&self, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
+        let Some(chunk) = self.shared.as_ref().map(ChunkReceiver::receive).transpose()?.flatten() else {
+            return Ok(None);
+        };
+        let actor = chunk.header().actor as usize;
+        self.append(replay, actor, &chunk).map(Some)
+    }
+
+    /// Appends the rows of a chunk, as many as the limit allows.
+    fn append(&self, replay: &mut Replay, actor: usize, chunk: &ReceivedChunk) -> Result<Appended, IntakeError> {
+        let rows = self.limit.saturating_sub(replay.head()).min(chunk.header().rows.into());
+        append(replay, actor, chunk, rows as usize * self.chunk.row.width())
     }
 
     /// Notifies every actor that there is a new policy.

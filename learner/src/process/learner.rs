@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
-use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier};
-use shoal_common::config::Mode;
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier};
+use shoal_common::config::{Config, Mode};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Heartbeat, LearnerReport};
 use shoal_common::role::{Activity, Role};
@@ -108,13 +108,7 @@ impl<'a> Learner<'a> {
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
-            intake: Intake::open(
-                domain,
-                config.actors.count,
-                config.actors.window,
-                config.chunk_layout(),
-                config.run.steps,
-            )?,
+            intake: open_intake(domain, config)?,
             policy_version: counters.policy_version,
             counted_rows: counters.rows,
             episodes: counters.episodes,
@@ -199,7 +193,8 @@ impl<'a> Learner<'a> {
         }
         self.actors_checked_at = Instant::now();
         while let Some(heartbeat) = self.heartbeats.receive()? {
-            if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.config.actors.max {
+            let has_own_service = heartbeat.index < self.settings.config.actors.max_on_a_host();
+            if heartbeat.role() == Some(Role::Actor) && has_own_service {
                 self.intake.open_receivers(self.domain, heartbeat.index + 1)?;
             }
         }
@@ -333,6 +328,15 @@ fn remaining_episodes(counters: &Counters, replay: &Replay) -> u64 {
 fn ended_episodes(replay: &Replay, rows: Range<u64>) -> u64 {
     let layout = replay.layout().row;
     rows.filter(|row| layout.read(replay.row(*row)).last).count() as u64
+}
+
+fn open_intake(domain: &Domain, config: &Config) -> Result<Intake, ChannelError> {
+    let (actors, chunk) = (&config.actors, config.chunk_layout());
+    let mut intake = Intake::open(domain, actors.count, actors.window, chunk, config.run.steps)?;
+    if config.actors_that_share() > 0 {
+        intake.open_shared_receiver(domain, config.actors_that_share())?;
+    }
+    Ok(intake)
 }
 
 fn empty_report() -> LearnerReport {

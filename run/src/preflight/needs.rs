@@ -21,7 +21,7 @@ const FILES_PER_ACTOR: u64 = 22;
 
 /// Bytes of shared memory that the run may come to use with `actors.max` actors.
 pub(super) fn shared_memory(config: &Config) -> u64 {
-    let max = config.actors.max as usize;
+    let max = config.actors.max_on_a_host() as usize;
     let (spec, actors) = (&config.spec, max as u64);
     let parameters = parameters(config);
     let of_an_actor = environment::reserved(spec, config.actors.envs as usize)
@@ -30,7 +30,8 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
     let roles = 2 * (max + 1) + 2;
     actors * of_an_actor
         + environment::reserved(spec, config.evaluation_envs() as usize)
-        + control::reserved(max)
+        + control::reserved(config.actors.max as usize)
+        + shared_transitions(config)
         + policy::reserved(max, parameters)
         + reports::reserved::<Heartbeat>(max, roles)
         // The actors' and the gate's.
@@ -40,6 +41,14 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<LearnerReport>(max, 1)
         // One for each process, and one for the launcher.
         + (roles as u64 + 1) * Listener::reserved(max)
+}
+
+/// Bytes of the service that actors of joined hosts share.
+fn shared_transitions(config: &Config) -> u64 {
+    match config.actors_that_share() {
+        0 => 0,
+        actors => transitions::reserved(&config.chunk_layout(), actors * config.actors.window),
+    }
 }
 
 /// Bytes of disk that the run's directory may come to need beyond what it holds now.
@@ -67,7 +76,7 @@ fn parameters(config: &Config) -> usize {
 
 /// Files that any one process of the run may have open.
 pub(super) fn open_files(config: &Config) -> u64 {
-    FILES + FILES_PER_ACTOR * u64::from(config.actors.max)
+    FILES + FILES_PER_ACTOR * u64::from(config.actors.max_on_a_host())
 }
 
 #[cfg(test)]

@@ -32,7 +32,8 @@ impl Supervisor {
     /// Takes free actors until this host has as many as are wanted. Another host may have to give some up first.
     pub(super) fn take_free_actors(&mut self) {
         if self.actors_to_take > 0 {
-            let more: Vec<u32> = self.free_actors().take(self.actors_to_take).collect();
+            let free = self.free_actors().filter(|index| *index < self.max_actors_here);
+            let more: Vec<u32> = free.take(self.actors_to_take).collect();
             self.actors_to_take -= more.len();
             self.actors.extend(more);
             self.actors.sort_unstable();

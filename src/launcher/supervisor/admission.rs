@@ -4,6 +4,7 @@ use std::collections::HashSet;
 
 use shoal_common::channel::Domain;
 use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus};
+use shoal_common::config::ActorsConfig;
 use shoal_common::role::Role;
 
 use super::Supervisor;
@@ -31,12 +32,20 @@ impl Supervisor {
             // The services of a retiring actor are in use.
             None => {
                 let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
-                let free = self.free_actors().filter(|index| !exists(*index));
+                let mut free: Vec<u32> = self.free_actors().filter(|index| !exists(*index)).collect();
+                // First those that this host cannot have.
+                free.sort_by_key(|index| (*index < self.max_actors_here, *index));
                 let kept = self.actors_to_take + self.joined_hosts.reserved();
-                let free: Vec<u32> = free.collect();
-                free[..free.len().saturating_sub(kept)].to_vec()
+                free.truncate(free.len().saturating_sub(kept));
+                free
             }
         };
+        if requested > ActorsConfig::MAX_ON_A_HOST {
+            let most = ActorsConfig::MAX_ON_A_HOST;
+            return Ok(ControlResponse::Refused(format!(
+                "a host may have {most} actors at most"
+            )));
+        }
         let requested = requested as usize;
         let distinct: HashSet<u32> = held.iter().copied().collect();
         let can_keep = held.len() == requested && distinct.len() == requested;
@@ -60,9 +69,10 @@ impl Supervisor {
         };
         actors.sort_unstable();
         let first_incarnation = self.take_incarnations(HostLease::INCARNATIONS)?;
-        // The learner opens those of all actors up to the last one.
-        let last = actors.iter().max().copied();
-        self.create_transitions(domain, last.map_or(0..0, |last| 0..last + 1))?;
+        // The learner opens those of all actors up to the last one that has a service of its own.
+        let with_service = actors.iter().filter(|index| **index < self.max_actors_here);
+        let end = with_service.max().map_or(0, |last| last + 1);
+        self.create_transitions(domain, 0..end)?;
         self.log
             .note("launcher", &format!("host {name} is admitted with actors {actors:?}"));
         let lease = HostLease {
