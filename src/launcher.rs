@@ -36,6 +36,7 @@ use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use shoal_run::records::recorder::Recorder;
 use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
+use signal_hook::consts::SIGTERM;
 
 pub(crate) use self::cleaner::run_in_child as run_clean_up;
 use self::end_roles::{EndRequest, EndRoles};
@@ -84,6 +85,13 @@ pub(crate) enum RunEnd {
     Interrupted(i32),
 }
 
+impl RunEnd {
+    /// Whether joined hosts end with the run. With `hosts_wait`, SIGTERM leaves them waiting.
+    fn ends_hosts(self, hosts_wait: bool) -> bool {
+        !(hosts_wait && self == Self::Interrupted(SIGTERM))
+    }
+}
+
 /// Why the roles were ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum RolesEnd {
@@ -111,6 +119,8 @@ pub(crate) struct RunOptions {
     pub(crate) quiet: bool,
     /// There is a gate, at the endpoint in `join.toml`.
     pub(crate) gate: bool,
+    /// The other hosts do not end with a run that SIGTERM ends.
+    pub(crate) hosts_wait: bool,
 }
 
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
@@ -243,9 +253,9 @@ fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     AtWork,
-    /// It ends the roles, and the run with them.
+    /// It ends the roles, and the run with them. The other hosts end too.
     RunEnds,
-    /// It ends the roles, because the run has failed or moves to new shared memory.
+    /// It ends the roles, but the other hosts wait: the run has failed, moves to new shared memory, or is to be resumed.
     RolesEnd,
 }
 
@@ -259,6 +269,7 @@ struct Launcher<'a> {
     /// The first request to end the run.
     end_request: Option<EndRequest<RunEnd>>,
     phase: Phase,
+    hosts_wait: bool,
     supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
@@ -279,7 +290,11 @@ impl<'a> Launcher<'a> {
         run: &'a LockedRun,
         domain: &'a Domain,
         signals: &'a Signals,
-        RunOptions { quiet, gate }: RunOptions,
+        RunOptions {
+            quiet,
+            gate,
+            hosts_wait,
+        }: RunOptions,
     ) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
@@ -298,6 +313,7 @@ impl<'a> Launcher<'a> {
             initial,
             end_request: None,
             phase: Phase::AtWork,
+            hosts_wait,
             run,
             domain,
             heartbeats: Reports::open(domain)?,
@@ -468,12 +484,13 @@ impl<'a> Launcher<'a> {
     }
 
     /// Ends all roles, the actors first, so that the learner still receives what they send. The other hosts are told if
-    /// the run is over, also if a request to end it comes while the roles end. If it is renewed, or after an error
-    /// (`None`), they are not told, and wait for it.
+    /// the run is over, also if a request to end it comes while the roles end. If it is renewed or to be resumed, or
+    /// after an error (`None`), they are not told, and wait for it.
     fn end_all(&mut self, ending: Option<RolesEnd>) -> anyhow::Result<()> {
+        let hosts_wait = self.hosts_wait;
         self.phase = match ending {
-            Some(RolesEnd::Run(_)) => Phase::RunEnds,
-            Some(RolesEnd::Renewal) | None => Phase::RolesEnd,
+            Some(RolesEnd::Run(end)) if end.ends_hosts(hosts_wait) => Phase::RunEnds,
+            _ => Phase::RolesEnd,
         };
         let was_asked = matches!(ending, Some(RolesEnd::Run(RunEnd::Stopped | RunEnd::Interrupted(_))));
         let receiver = was_asked.then_some(Role::Learner);
@@ -485,9 +502,9 @@ impl<'a> Launcher<'a> {
         self.supervisor.ask_to_end(|role| role == Role::Actor);
         self.await_end(|role| role == Role::Actor, ACTORS_END, receiver);
         self.take_signal();
-        let is_over = |end_request: Option<_>| match ending {
-            Some(RolesEnd::Renewal) => end_request.is_some(),
-            Some(RolesEnd::Run(_)) => true,
+        let is_over = |end_request: Option<EndRequest<RunEnd>>| match ending {
+            Some(RolesEnd::Renewal) => end_request.is_some_and(|request| request.end.ends_hosts(hosts_wait)),
+            Some(RolesEnd::Run(end)) => end.ends_hosts(hosts_wait),
             None => false,
         };
         let are_told = is_over(self.end_request);
@@ -569,6 +586,7 @@ impl EndRoles for Launcher<'_> {
             progress,
             initial,
             phase,
+            hosts_wait,
             end_request,
             log,
             domain,
@@ -588,7 +606,10 @@ impl EndRoles for Launcher<'_> {
                     ControlRequest::Scale(_) if *phase == Phase::RunEnds => Ok(Some(ControlResponse::RunIsEnding)),
                     ControlRequest::Scale(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
                     ControlRequest::Scale(request) => requests::scale(config, run, supervisor, &request, now).map(Some),
-                    ControlRequest::Admit(_) if *phase == Phase::RunEnds || end_request.is_some() => {
+                    ControlRequest::Admit(_)
+                        if *phase == Phase::RunEnds
+                            || end_request.is_some_and(|request| request.end.ends_hosts(*hosts_wait)) =>
+                    {
                         Ok(Some(ControlResponse::RunIsEnding))
                     }
                     ControlRequest::Admit(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
@@ -618,7 +639,7 @@ impl EndRoles for Launcher<'_> {
 
 /// The answer to a request that needs roles, while they end and the run may continue with others.
 fn roles_are_ending() -> ControlResponse {
-    ControlResponse::Refused("the run has failed, or moves to new shared memory; try again".into())
+    ControlResponse::Refused("the processes of the run are ending; try again when it continues".into())
 }
 
 /// Passes all received reports to `handle`. Returns the fraction of one sender's buffer that they would fill.

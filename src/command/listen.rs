@@ -27,7 +27,8 @@ fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf
     use shoal_remote::keys::{self, VALID};
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
-    if new || !(gate.exists() && join.exists()) {
+    let exists = |key: &PathBuf| key.try_exists().with_context(|| format!("cannot inspect {}", key.display()));
+    if new || !(exists(&gate)? && exists(&join)?) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
         // If this process is killed in between, one of two keys that do not match must not be left.
         match std::fs::remove_file(&join) {
@@ -57,14 +58,24 @@ pub(crate) struct ListenArgs {
     /// Make new keys. The old `join.key` opens nothing any more.
     #[arg(long, requires = "listen")]
     pub(crate) new_keys: bool,
+
+    /// After SIGTERM, end without the other hosts: they wait for `resume`. For schedulers that requeue jobs.
+    #[arg(long, requires = "listen")]
+    pub(crate) hosts_wait: bool,
 }
 
 impl ListenArgs {
     /// These options, for another process.
     pub(crate) fn arguments(&self) -> Vec<OsString> {
-        let Self { listen, new_keys } = self;
+        let Self {
+            listen,
+            new_keys,
+            hosts_wait,
+        } = self;
         let listen = listen.iter().map(|endpoint| format!("--listen={endpoint}").into());
-        listen.chain(new_keys.then(|| "--new-keys".into())).collect()
+        let flags = [(*new_keys, "--new-keys"), (*hosts_wait, "--hosts-wait")];
+        let set = flags.into_iter().filter(|(is_set, _)| *is_set);
+        listen.chain(set.map(|(_, flag)| flag.into())).collect()
     }
 
     /// Checks the endpoint before the run is created.

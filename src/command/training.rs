@@ -72,6 +72,7 @@ pub(crate) fn run_training(
     let options = RunOptions {
         quiet: output.quiet,
         gate,
+        hosts_wait: listen.hosts_wait,
     };
     let trained = train_and_report(config, run, output, options);
     // If the directory is gone, that explains every other error.

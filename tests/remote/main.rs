@@ -401,6 +401,26 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
 }
 
 #[test]
+fn hosts_wait_for_a_run_that_a_scheduler_ends_and_resumes() {
+    let run = Run::start(&["--actors", "1", "--hosts-wait"]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    let endpoint = run.endpoint();
+    run.running.signal(Signal::TERM);
+    let Run { place, running } = run;
+    let (code, ..) = running.wait_for_launcher();
+    assert_eq!(code, Some(128 + 15));
+    let running = place.resume("run", &["--listen", &endpoint, "--hosts-wait"]);
+    let run = Run { place, running };
+    wait_for_actors(&run, &[1, 2]);
+    assert_eq!(host.running.pids("actor-1").len(), 1, "the host's actors need no restart");
+    let path = stop(run);
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1, 2]), sent);
+}
+
+#[test]
 fn hosts_end_with_a_run_whose_gate_dies_while_it_tells_them() {
     let run = Run::start(&["--actors", "1"]);
     let host = Host::join(&run, &["--actors", "1"]);

@@ -19,10 +19,10 @@ run=${RUN:-$PWD/runs/slurm}      # on a file system that all nodes see
 
 case ${1:-} in
   learner)
-    if [ -d "$run" ]; then
-      exec shoal resume "$run" --listen --quiet
+    if [ -f "$run/config.toml" ]; then
+      exec shoal resume "$run" --listen --hosts-wait --quiet
     fi
-    exec shoal train "$what" --run "$run" --listen --set actors.max=256 --quiet
+    exec shoal train "$what" --run "$run" --listen --hosts-wait --set actors.max=256 --quiet
     ;;
   actors)
     # The learner's job may start later than this one.
