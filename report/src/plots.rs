@@ -41,7 +41,7 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interr
     if !run.best_policy().exists() {
         return Ok(drawn);
     }
-    if config.environment.server.is_empty() {
+    if !config.environment.is_external() {
         drawn.files.extend(behaviour(run, config, out)?);
     } else if let Some(interrupt) = interrupt
         && let Some(description) = description::kept(run, config)?

@@ -84,7 +84,7 @@ impl Played {
             ..
         } = description::of_run(run, config)?;
         // Built-in environments are drawn by the page, from their signals.
-        let is_external = !config.environment.server.is_empty();
+        let is_external = config.environment.is_external();
         let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;
         let (mut no_pictures, mut pace) = (None, None);
         if is_external && limits.pictured > 0 {
