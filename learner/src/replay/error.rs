@@ -52,12 +52,12 @@ pub enum ReplayError {
         source: io::Error,
     },
     /// The system reports another error.
-    #[error("{path}: cannot {doing} the replay: {source}")]
+    #[error("{path}: cannot {action} the replay: {source}")]
     Io {
         /// The file.
         path: PathBuf,
         /// What failed, as a verb.
-        doing: &'static str,
+        action: &'static str,
         /// The system's reason.
         source: io::Error,
     },

@@ -133,7 +133,7 @@ pub(super) fn recover(
     })
 }
 
-/// What is lost: the record `published`, rows after those of `best`, or rows from `expected` on.
+/// What is lost: the record `published`, rows after the head of `best`, or rows from `expected` on.
 fn warnings(best: &Candidate<'_>, newest: &CommitRecord, published: u64, expected: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if newest.generation() < published {

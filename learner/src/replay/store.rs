@@ -52,7 +52,7 @@ impl Replay {
     fn map(path: &Path, layout: &ReplayLayout, offsets: FileOffsets, file: File) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io {
             path: path.into(),
-            doing: "map",
+            action: "map",
             source,
         };
         let words = WritableWords::map(&file, offsets.header).map_err(io)?;

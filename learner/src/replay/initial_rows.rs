@@ -1,4 +1,5 @@
-//! Beginning with rows that no actor of the run has sent: those of another replay, or others.
+//! The initial rows: rows that a replay begins with, which belong to no actor. They come from another replay or a
+//! dataset.
 
 use std::sync::atomic::{Ordering, fence};
 
@@ -55,7 +56,7 @@ impl Replay {
         }
         // The rows are in the file before a record names them.
         fence(Ordering::Release);
-        self.record.add_inherited_rows(count);
+        self.record.add_initial_rows(count);
         self.publish(self.record.generation() + 1);
         self.flush()?;
         Ok(count)
