@@ -4,9 +4,9 @@ use shoal_run::evaluation::analysis::point_mass::{Measures, NEAR_STARTS, REACHED
 
 use super::super::claim::{Claim, Scope, percent, spread};
 use super::super::result::SeedResult;
-use super::Tests;
+use super::Measurements;
 
-type Seed = SeedResult<Tests>;
+type Seed = SeedResult<Measurements>;
 
 /// A measure of one test run.
 type Measure = fn(&Measures) -> f64;
