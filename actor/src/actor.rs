@@ -321,15 +321,15 @@ impl<'a> Actor<'a> {
             stop,
             ..
         } = self;
-        let newest = |reader: &mut PolicyReader| -> Result<Option<Rc<PublishedPolicy>>, _> {
+        let latest = |reader: &mut PolicyReader| -> Result<Option<Rc<PublishedPolicy>>, _> {
             Ok(reader.latest()?.filter(|policy| policy.header().version >= wanted))
         };
-        let newest = match newest(policy)? {
+        let newest = match latest(policy)? {
             Some(newest) => newest,
             None => wait_for(
                 listener,
                 stop,
-                || newest(policy),
+                || latest(policy),
                 || {
                     heartbeat.beat(Activity::WaitingForPeer);
                     // A restarted learner may need the last chunks before it can publish a policy.
@@ -344,7 +344,7 @@ impl<'a> Actor<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, policy: &PublishedPolicy, current: &EnvironmentResponse) {
         let act = match policy.header().updates {
-            0 if !self.settings.starts_with_learned_policy => Exploration::warm_up,
+            0 if !self.settings.starts_with_learned_policy => Exploration::warmup,
             _ => Exploration::act,
         };
         let steps = StepCounts {

@@ -41,7 +41,7 @@ impl ActorSnapshot {
     }
 
     /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of
-    /// transitions of several steps; `None` if their count is not that of `layout`.
+    /// transitions of several steps; `None` if `layout` has another number of words.
     pub(crate) fn read(
         words: &[u64],
         layout: &ChunkLayout,

@@ -11,7 +11,7 @@ use toml::{Table, Value};
 use super::sections::is_gymnasium;
 use super::source::SettingSources;
 use super::suggestion::{nearest, with_suggestion};
-use crate::external_environment::server_location::{ServerLocation, ServerSurroundings, hash_seed};
+use crate::external_environment::server_location::{LaunchContext, ServerLocation, hash_seed};
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::plan::algorithm;
 use crate::signals::Interrupt;
@@ -48,7 +48,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
     };
     let (environment, spec, description) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let surroundings = ServerSurroundings {
+        let surroundings = LaunchContext {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
             picture_height: None,
