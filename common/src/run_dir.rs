@@ -70,7 +70,7 @@ fn suite(path: &Path) -> String {
     runs.sort_by(|a, b| (a.len(), a).cmp(&(b.len(), b)));
     let here = path.display();
     let Some(first) = runs.first() else {
-        return format!("it is a suite of runs, of which none has begun: shoal resume {here}");
+        return format!("it is a suite, and none of its runs has begun: shoal resume {here}");
     };
     let shown = runs.iter().take(SHOWN).cloned().collect::<Vec<_>>().join(", ");
     let others = match runs.len().saturating_sub(SHOWN) {
@@ -256,7 +256,7 @@ impl RunDir {
             run: self.clone(),
             directory: file,
         };
-        // Its last owner may have removed it meanwhile.
+        // Before the lock was taken, its last owner may have removed it.
         if locked.is_elsewhere() {
             return Err(RunDirError::Gone(self.path.clone()));
         }
@@ -303,7 +303,7 @@ impl RunDir {
         if used.exists() {
             Config::load(&used)
         } else {
-            // A run of an earlier version, or one that has just been made.
+            // A run of an earlier version, or a run that has just been made.
             Config::load(&self.config_file())
         }
     }

@@ -47,7 +47,7 @@ pub struct Report {
     version: &'static str,
     /// Seconds since 1970.
     made: u64,
-    /// The start of the suite whose runs these are; `None` if they are not exactly those of one suite.
+    /// The start of the suite whose runs these are; `None` if they are not exactly the runs of one suite.
     suite: Option<StartRecord>,
     runs: Vec<Run>,
     comparisons: Vec<Comparison>,

@@ -72,7 +72,12 @@ impl Demonstrations {
             let why = last.or_else(|| lines.clone().next()).unwrap_or("no message");
             bail!("--demonstrations {dataset}: {why}");
         }
-        Self::parse(stdout).with_context(|| format!("--demonstrations {dataset}: python3 has another package shoal"))
+        Self::parse(stdout).with_context(|| {
+            format!(
+                "--demonstrations {dataset}: python3 has an incompatible version of the package shoal; reinstall it: pip \
+                 install ./python"
+            )
+        })
     }
 
     /// The contents of such a file.

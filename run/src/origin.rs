@@ -31,7 +31,7 @@ pub enum Origin {
     Dataset(DatasetOrigin),
 }
 
-/// A dataset with whose rows a replay began.
+/// The dataset that supplied the initial rows.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DatasetOrigin {
     /// Its name.
@@ -42,7 +42,7 @@ pub struct DatasetOrigin {
     pub rows: u64,
 }
 
-/// A run with whose networks another one began.
+/// The run that supplied the initial networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOrigin {
     /// The directory of the other run.

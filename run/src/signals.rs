@@ -70,7 +70,7 @@ impl Signals {
             }
             Ok(Self { last, wake })
         };
-        // Before the first handler: one that an earlier receiver has left must not end the process either.
+        // Before the first handler is registered: a handler that an earlier receiver has left must not end the process.
         change_receivers(|receivers| receivers + 1);
         let signals = registered().inspect_err(|_| change_receivers(|receivers| receivers - 1));
         signals.context("cannot watch for signals")

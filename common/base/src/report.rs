@@ -23,7 +23,7 @@ pub struct Heartbeat {
     pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,
-    /// Environment steps since it started; for a learner gradient steps, or rows where each is used once.
+    /// Environment steps since it started; for a learner updates: gradient steps, or consumed rows (`TransitionUse`).
     pub steps: u64,
     /// Version of the policy it uses or publishes.
     pub policy_version: u64,
@@ -93,7 +93,7 @@ pub struct EvaluationReport {
     pub policy_version: u64,
     /// Environment steps that the policy was learned from.
     pub env_steps: u64,
-    /// Gradient steps that made the policy; rows where each is used once.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`), that made the policy.
     pub updates: u64,
     /// Mean of the episodes' returns.
     pub return_mean: f64,
@@ -121,7 +121,7 @@ pub struct LearnerReport {
     pub env_steps: u64,
     /// Episodes that end within them.
     pub episodes: u64,
-    /// Gradient steps made so far; rows where each is used once.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`), so far.
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,

@@ -149,7 +149,7 @@ impl Domain {
     }
 
     /// The same for the run `run_id`, for a process that has not joined it. Its path is short and has only plain
-    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and those of more than
+    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and paths of more than
     /// 255 bytes.
     ///
     /// # Errors
@@ -193,7 +193,7 @@ impl Domain {
         same && details.exists() && listed >= services
     }
 
-    /// Whether a process of the run is alive, even one that iceoryx2 does not find. Visitors are not counted.
+    /// Whether a process of the run is alive, even if iceoryx2 does not find it. Visitors are not counted.
     pub fn has_members(&self) -> bool {
         matches!(presence::claim(&self.run_id), Ok(Claim::Held))
     }
@@ -247,7 +247,7 @@ impl Domain {
         }
     }
 
-    /// Removes the files of those of this user's runs that no longer have a living process.
+    /// Removes the files of this user's runs that no longer have a living process.
     ///
     /// # Errors
     /// When the user's directory cannot be read, or files cannot be removed.
@@ -284,7 +284,7 @@ fn close_to_others(run_id: &str) -> Result<(), DomainError> {
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
         if path.extension().is_some_and(|extension| extension == "global_mgmt") {
             std::fs::set_permissions(&path, Permissions::from_mode(0o600))
-                .map_err(io_error("restrict the rights of", &path))?;
+                .map_err(io_error("restrict the permissions of", &path))?;
         }
     }
     Ok(())

@@ -47,7 +47,7 @@ pub enum PolicyFileError {
         reason: String,
     },
     /// The file cannot be written. An older file is intact.
-    #[error("{path}: cannot write the policy: {source}; free some space or check the rights of the directory")]
+    #[error("{path}: cannot write the policy: {source}; free some space or check the permissions of the directory")]
     Write {
         /// The file.
         path: PathBuf,

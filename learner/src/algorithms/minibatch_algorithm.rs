@@ -132,7 +132,7 @@ pub(super) fn targets(batch: &Minibatch, value: impl Fn(usize) -> f32, y: &mut D
     }
 }
 
-/// The mean of the numbers, of which there must be at least one.
+/// The mean of at least one number.
 pub(super) fn mean(numbers: impl ExactSizeIterator<Item = f32>) -> f32 {
     let count = numbers.len() as f32;
     numbers.sum::<f32>() / count

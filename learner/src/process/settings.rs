@@ -59,7 +59,7 @@ pub enum LearnerError {
     /// The losses are no longer finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
-        /// Gradient steps taken; for algorithms that use each row once, rows consumed.
+        /// Updates: gradient steps, or consumed rows (`TransitionUse`).
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.

@@ -35,7 +35,7 @@ pub(super) struct RankedSetting {
     pub(super) label: String,
     /// The number of its runs with a result.
     pub(super) runs: usize,
-    /// How many of them have not finished: their result is that of their last evaluation.
+    /// How many of them have not finished: their result is their last evaluation.
     pub(super) unfinished: usize,
     /// The interquartile mean of their results: without the best and the worst quarter, if there are at least four.
     pub(super) mean: f64,
