@@ -184,7 +184,7 @@ fn state_after_early_end(run: &RunDir) -> anyhow::Result<(ListedState, Option<St
     })
 }
 
-/// The same for a run of an earlier version, which wrote no outcome: by the last line of its log.
+/// The state of a run of an earlier version, which wrote no outcome: it follows from the last line of the log.
 fn state_from_log(run: &RunDir) -> io::Result<ListedState> {
     let mut file = match File::open(run.log()) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ListedState::New),

@@ -14,7 +14,7 @@ pub(crate) struct ActorSnapshot {
     pub(crate) exploration: Vec<f64>,
     /// Returns of the current episodes.
     pub(crate) returns: Vec<f64>,
-    /// Their lengths.
+    /// Lengths of the current episodes.
     pub(crate) lengths: Vec<u32>,
     /// The state of [`NStepTransitions`](crate::n_step::NStepTransitions).
     pub(crate) n_step: Vec<u64>,

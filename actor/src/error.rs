@@ -33,7 +33,7 @@ pub enum ActorError {
     /// The environment server serves other environments than the run's configuration has.
     #[error("environment server {index} serves {served}, but the run's config.toml asks for {configured}")]
     Server {
-        /// The server.
+        /// Index of the environment server.
         index: u32,
         /// What it serves.
         served: String,

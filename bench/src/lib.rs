@@ -30,7 +30,7 @@ use shoal_run::usage::UsageError;
 
 use self::measurement::{TimeBudget, print};
 
-/// The algorithms that [`Stage::Learner`] can measure: those that learn from minibatches.
+/// The algorithms that [`Stage::Learner`] can measure, which learn from minibatches.
 pub fn algorithms() -> impl Iterator<Item = &'static str> {
     AlgorithmConfig::of_minibatches().map(|algorithm| algorithm.name())
 }

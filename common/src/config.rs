@@ -72,7 +72,7 @@ pub enum ConfigError {
     /// The file could not be read.
     #[error("cannot read {path}: {cause}")]
     Unreadable {
-        /// The file.
+        /// The configuration file.
         path: PathBuf,
         /// The system's reason.
         cause: std::io::Error,
@@ -97,9 +97,9 @@ pub enum ConfigError {
     /// The algorithm does not fit the environment.
     #[error("{algorithm} cannot control {environment}: {cause}; choose {fitting}")]
     Control {
-        /// The algorithm.
+        /// Name of the algorithm.
         algorithm: &'static str,
-        /// The environment.
+        /// Name of the environment.
         environment: String,
         /// What does not fit.
         cause: PolicyError,

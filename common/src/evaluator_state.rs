@@ -15,7 +15,7 @@ const KIND: FileKind = FileKind {
     name: "an evaluator's state",
 };
 
-/// The newest evaluations of a run: at least those that the launcher may not have received yet.
+/// The newest evaluations of a run, at least all that the launcher may not have received yet.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EvaluatorState {
     evaluations: VecDeque<EvaluationReport>,

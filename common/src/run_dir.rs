@@ -40,9 +40,9 @@ pub enum RunDirError {
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
     Io {
-        /// What was tried.
+        /// What was tried, as a verb.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
         /// The system's reason.
         cause: io::Error,

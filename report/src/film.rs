@@ -38,7 +38,7 @@ const PAUSE: f64 = 0.6;
 
 /// Steps in a second where nothing says how many there are.
 const STEPS_PER_SECOND: f64 = 30.0;
-/// The same where the states are places, such as cells of a grid.
+/// Steps in a second where the states are places, such as cells of a grid.
 const MOVES_PER_SECOND: f64 = 4.0;
 
 /// The file formats.

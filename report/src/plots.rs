@@ -19,7 +19,7 @@ use crate::figure;
 /// The figures of a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Drawn {
-    /// Their files.
+    /// The files of the figures.
     pub files: Vec<PathBuf>,
     /// Why an episode is missing among them: a sentence without its full stop. The program that serves the environment
     /// has failed.

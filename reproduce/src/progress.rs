@@ -21,7 +21,7 @@ pub(super) struct ProgressDisplay<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
-    /// Number of all jobs, including those that had finished before the batch began.
+    /// Number of all jobs, including jobs that had finished before the batch began.
     total: usize,
     /// Every job that had not finished when the batch began.
     due: BTreeMap<JobName, Due>,

@@ -82,7 +82,7 @@ impl SeedQueue<'_> {
     }
 
     fn work(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) {
-        // A closed channel is no reason to stop: the results are still stored.
+        // A closed channel does not end the work: the results are still stored.
         let _ = events.send(Event::Started(job));
         match self.run_stages(job, signals, events) {
             Ok(TrainingEnd::Finished) => _ = events.send(Event::Finished(job)),

@@ -88,7 +88,7 @@ impl Signals {
         Interrupt(Arc::clone(&self.last))
     }
 
-    /// Waits at most `patience` for a signal; the last one that has arrived, if any.
+    /// Waits at most `patience` for a signal. Returns the last signal that has arrived, if any.
     pub fn wait(&self, patience: Duration) -> Option<i32> {
         if self.last.load(Ordering::Relaxed) == 0 {
             wait_for_any(&[self.as_fd()], patience);

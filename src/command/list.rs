@@ -35,7 +35,7 @@ struct Printed<'a> {
 #[derive(Serialize)]
 struct ListedSuite {
     path: PathBuf,
-    /// The number of its runs, and of those that have begun.
+    /// The number of its runs, and how many of them have begun.
     runs: usize,
     begun: usize,
 }

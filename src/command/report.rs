@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         [one] if Suite::read(one)?.is_some() => StartRecord::read(one)?,
         _ => None,
     };
-    // Pictures of some environments take a while. Nothing is shown where standard error is no terminal.
+    // Pictures of some environments take a while. Nothing is shown where standard error is not a terminal.
     let bar = ProgressBar::new_spinner().with_message("reading the runs and playing episodes");
     bar.enable_steady_tick(Duration::from_millis(200));
     let report = page::gather(&runs, suite);

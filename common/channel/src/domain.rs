@@ -44,9 +44,9 @@ pub enum DomainError {
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
     Io {
-        /// What was tried.
+        /// What was tried, as a verb.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
         /// The system's reason.
         cause: io::Error,
@@ -64,15 +64,15 @@ pub enum DomainError {
         pids.iter().map(i32::to_string).collect::<Vec<_>>().join(" ")
     )]
     StillAlive {
-        /// The run.
+        /// The id of the run.
         run_id: String,
-        /// Their process ids.
+        /// The ids of the living processes.
         pids: Vec<i32>,
     },
     /// iceoryx2 refused.
     #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
     Join {
-        /// The run.
+        /// The id of the run.
         run_id: String,
         /// iceoryx2's reason.
         cause: String,
@@ -148,7 +148,7 @@ impl Domain {
         Self::directory_of(&self.run_id)
     }
 
-    /// The same for the run `run_id`, for a process that has not joined it. Its path is short and has only plain
+    /// The directory of the run `run_id`, for a process that has not joined it. Its path is short and has only plain
     /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and paths of more than
     /// 255 bytes.
     ///

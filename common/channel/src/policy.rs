@@ -207,8 +207,8 @@ fn nodes(max_actors: usize) -> usize {
     max_actors + 4
 }
 
-/// Policies that can be in use at once: those that readers hold, the newest one, its replacement while that is being
-/// published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
+/// Policies that can be in use at once: the policies that readers hold, the newest one, its replacement while that is
+/// being published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
 fn samples(max_actors: usize) -> usize {
     let (waiting, being_written) = (2, 1);
     readers(max_actors) * BORROWED + waiting + being_written

@@ -15,7 +15,7 @@ use crate::replay::Replay;
 
 /// An algorithm that takes gradient steps with minibatches, wherever those come from.
 pub trait MinibatchAlgorithm {
-    /// The policy's parameters, without those that normalise observations.
+    /// The policy's parameters, without the statistics of observations.
     fn policy(&self) -> &[f32];
 
     /// Gradient steps taken.
@@ -32,7 +32,8 @@ pub trait MinibatchAlgorithm {
     /// Everything that the next gradient step depends on besides the batch, by name.
     fn state(&self) -> Vec<StateArray<'_>>;
 
-    /// The same numbers, to be overwritten with those after `updates` gradient steps.
+    /// The arrays of `state`, to be overwritten with the state after `updates` gradient steps. Sets the number of
+    /// steps.
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>>;
 }
 

@@ -55,7 +55,7 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        // With three or more hidden layers, there are products below the last one that are large enough to share.
+        // With three or more hidden layers, products below the last layer are large enough to share.
         if self.d.len() > 2 {
             let cut = threads.first_share(d.ncols());
             let d = d.as_slice().split_at(cut * d.nrows());

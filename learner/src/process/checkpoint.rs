@@ -66,7 +66,7 @@ pub enum CheckpointError {
              last checkpoint is intact)"
     )]
     Write {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
@@ -74,7 +74,7 @@ pub enum CheckpointError {
     /// It could not be read. It may be whole.
     #[error("{path}: cannot read the checkpoint: {source}; the file was left as it is")]
     Read {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
@@ -85,7 +85,7 @@ pub enum CheckpointError {
              program"
     )]
     Refused {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// What differs.
         reason: String,

@@ -56,7 +56,7 @@ pub enum LearnerError {
     /// The last policy cannot be written.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
-    /// The losses are no longer finite.
+    /// A loss is not finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
         /// Updates: gradient steps, or consumed rows (`TransitionUse`).

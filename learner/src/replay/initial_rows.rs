@@ -32,7 +32,7 @@ impl Replay {
     /// When the file cannot be synced.
     ///
     /// # Panics
-    /// If this replay is not empty, if these are no whole rows, or if they are more than a ring.
+    /// If this replay is not empty, if the last row is not whole, or if there are more rows than in a ring.
     pub fn begin_with_rows(&mut self, numbers: &[f32]) -> Result<u64, ReplayError> {
         let width = self.layout.row.width();
         assert!(numbers.len().is_multiple_of(width), "rows of another layout");

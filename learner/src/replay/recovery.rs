@@ -50,8 +50,8 @@ impl Candidate<'_> {
     }
 }
 
-/// Chooses the newest record if all its rows are intact, except those that were being overwritten. Otherwise, the
-/// record under which most of the synced rows are intact, then the one with most rows.
+/// Chooses the newest record if all its rows are intact, except rows that were being overwritten. Otherwise, the record
+/// under which most of the synced rows are intact, then the one with most rows.
 pub(super) fn recover(
     words: &Words,
     offsets: &FileOffsets,

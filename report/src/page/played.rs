@@ -53,7 +53,7 @@ pub(super) struct Episode {
 }
 
 impl Played {
-    /// Runs the first evaluation episodes of the run's seed. A failure is no error: its reason is in `why_not`.
+    /// Runs the first evaluation episodes of the run's seed. A failure is not an error: its reason is in `why_not`.
     pub(super) fn of(run: &RunDir, config: &Config, limits: PageLimits) -> Self {
         let why_not = |why_not: String| Self {
             why_not: Some(why_not),

@@ -105,7 +105,7 @@ const MIN_RATE_SPAN: f64 = 0.2;
 #[derive(Clone, Debug, Serialize)]
 struct LearnerCurves {
     steps: Vec<u64>,
-    /// In s.
+    /// Running time, in s.
     time: Vec<f64>,
     ratio: Vec<f64>,
     env_steps_per_second: Vec<f64>,

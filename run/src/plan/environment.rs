@@ -96,7 +96,7 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
     sources.error_naming_source(&format!("environment.{key}"), &text)
 }
 
-/// Takes a key of `[environment]` that is no parameter of the environment.
+/// Takes a key of `[environment]` that is not a parameter of the environment.
 fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
     let Some(value) = section.remove(key) else {
         return Ok(None);

@@ -98,7 +98,7 @@ impl RunOverrides {
     /// The overrides of arguments that [`arguments`](Self::arguments) has returned.
     ///
     /// # Errors
-    /// When they are no such arguments.
+    /// When there is another argument among them.
     pub fn from_arguments(arguments: &[String]) -> anyhow::Result<Self> {
         #[derive(Parser)]
         struct Arguments {

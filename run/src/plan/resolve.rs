@@ -136,7 +136,7 @@ fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow
     Ok(())
 }
 
-/// Sets the shapes of the networks of the `--from` run, except those that the user has set.
+/// Sets the shapes of the networks of the `--from` run, except keys that the user has set.
 fn set_from_predecessor(
     table: &mut Table,
     sources: &mut SettingSources,

@@ -62,7 +62,7 @@ impl NetworkLayout {
     }
 
     /// The same network, which normalises its inputs or not. If it does, a mean and a factor for each input follow the
-    /// layers in the parameter slice ([`normalise`](super::normalise)).
+    /// layers in the parameter slice ([`normalise`](super::normalise())).
     pub fn normalising(self, normalised: bool) -> Self {
         Self { normalised, ..self }
     }
