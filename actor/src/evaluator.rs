@@ -40,7 +40,7 @@ pub struct EvaluatorSettings {
 }
 
 impl EvaluatorSettings {
-    /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous one
+    /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous evaluator
     /// evaluated last.
     pub fn new(config: &Config, run: &RunDir, instance: RoleInstance, evaluated_period: Option<u64>) -> Self {
         Self {
@@ -56,8 +56,8 @@ impl EvaluatorSettings {
 
 /// Decides whether a candidate replaces the best policy. Returns the one to keep, and whether it is the candidate.
 /// Among many policies, some do well on a few episodes by chance. A candidate that seems better than the best must
-/// therefore be better on other episodes too. `confirm` returns the mean return on those, or `None` if nothing is to be
-/// confirmed.
+/// therefore be better on other episodes too. `confirm` returns the mean return on these other episodes, or `None` if
+/// nothing is to be confirmed.
 fn better_of<E>(
     best: Option<EvaluatedPolicy>,
     mut candidate: EvaluatedPolicy,
@@ -250,7 +250,8 @@ impl<'a> Evaluator<'a> {
         Ok(replaced)
     }
 
-    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on. Returns their returns.
+    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on. Returns the returns of the
+    /// episodes.
     fn returns(&mut self, parameters: &[f32], first: u32, episodes: u32) -> Result<Vec<f64>, Exit<ActorError>> {
         let mut returns = Vec::new();
         while (returns.len() as u32) < episodes {
@@ -301,7 +302,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Runs evaluation episodes with these parameters, from number `first` on: one in each environment, and at most
-    /// `episodes_left`. Returns their returns, or `None` if the server was lost.
+    /// `episodes_left`. Returns the returns of the episodes, or `None` if the server was lost.
     fn run_episodes(
         &mut self,
         parameters: &[f32],

@@ -364,8 +364,8 @@ impl ExternalEnvironment {
         frame::read(file).context("the environment server's picture cannot be read")
     }
 
-    /// Whether the wait for an answer has ended without one: in time none came, or a signal did. A new server would take
-    /// as long.
+    /// Whether the wait for an answer has ended without an answer, because of the time limit or a signal. A new server
+    /// would take as long.
     pub fn is_silent(&self) -> bool {
         self.silent.get()
     }

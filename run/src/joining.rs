@@ -11,8 +11,8 @@ use crate::external_environment::server_location::{LaunchContext, ServerLocation
 use crate::signals::Interrupt;
 
 /// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a
-/// name of their own, so a host may join a run of the same machine. `first_incarnation` is the first that they may
-/// have.
+/// name of their own, so a host may join a run of the same machine. `first_incarnation` is the first incarnation that
+/// they may have.
 ///
 /// # Errors
 /// When the directory exists, the configuration cannot be used here, or an environment that another program serves has

@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn a_signal_wakes_a_waiting_thread_and_is_remembered() {
-        // An earlier receiver and another one at the same time, which are gone by then, do not count.
+        // Receivers that have been dropped do not count.
         drop(Signals::register().unwrap());
         let signals = Signals::register().unwrap();
         drop(Signals::register().unwrap());

@@ -308,8 +308,8 @@ impl Suite {
         })
     }
 
-    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs, without
-    /// the runs whose result is not finite. Returns the names of the ended runs.
+    /// Ends the worse half of the settings that are left: the settings with the lower mean of `result` over their runs.
+    /// Runs whose result is not finite do not count. Returns the names of the ended runs.
     pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
         let mut left = self.settings();
         left.retain(|setting| !self.was_ended_early(&self.trials[setting[0]]));

@@ -1,5 +1,5 @@
 //! Repeats gradient steps of PyTorch's autograd and Adam: from the `initial` networks, one step for each of `batches`.
-//! After each step the losses and networks must be those in `expected`.
+//! After each step the losses and networks must be as in `expected`.
 
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;

@@ -13,7 +13,7 @@ use super::sampling::Sampler;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// An algorithm that takes gradient steps with minibatches, wherever those come from.
+/// An algorithm that takes gradient steps with minibatches from any source.
 pub trait MinibatchAlgorithm {
     /// The policy's parameters, without the statistics of observations.
     fn policy(&self) -> &[f32];

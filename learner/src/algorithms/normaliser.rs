@@ -17,8 +17,8 @@ pub(super) fn set_rows(state: &mut [f32], rows: u64) {
     state.iter_mut().zip(halves).for_each(|(number, half)| *number = half);
 }
 
-/// Mean and variance of the observations in the rows of a replay. Each row is counted once: those up to a number that
-/// is part of the state.
+/// Mean and variance of the observations in the rows of a replay. Each row is counted once: the state has the number of
+/// rows counted so far.
 #[derive(Clone, Debug)]
 pub(super) struct Normaliser {
     width: usize,

@@ -96,7 +96,8 @@ impl Pass {
         self.lowest_gradients(threads, parameters, x, d, lowest);
     }
 
-    /// The gradients of the third layer and those above it. Returns the part of `gradient` for the two lowest layers.
+    /// The gradients of the third layer and of the layers above it. Returns the part of `gradient` for the two lowest
+    /// layers.
     fn upper_gradients<'a>(&self, threads: &Threads, d: &DMatrix<f32>, gradient: &'a mut [f32]) -> &'a mut [f32] {
         let last = self.h.len();
         let mut rest = gradient;

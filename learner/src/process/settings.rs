@@ -89,8 +89,8 @@ pub enum SizeError {
     },
 }
 
-/// Bytes that the learner's files need on the disk, for a run in the directory `run`. A replay that exists already is
-/// not counted, nor what a start that was killed has reserved for one.
+/// Bytes that the learner's files need on the disk, for a run in the directory `run`. Not counted are a replay that
+/// exists already, and space that a killed start has reserved for one.
 ///
 /// # Errors
 /// When the files would be too large.

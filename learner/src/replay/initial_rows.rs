@@ -11,7 +11,7 @@ const AT_ONCE: u64 = 4_096;
 
 impl Replay {
     /// Fills this empty replay with the newest rows of another one, at most `most` and at most a ring, and syncs them.
-    /// They belong to no actor. Returns their number.
+    /// Returns their number.
     ///
     /// # Errors
     /// When the file cannot be synced.
@@ -25,8 +25,7 @@ impl Replay {
         self.begin_with(rows.end - first, |index| other.row(first + index))
     }
 
-    /// Fills this empty replay with these rows, one after the other, and syncs them. They belong to no actor. Returns
-    /// their number.
+    /// Fills this empty replay with these rows, one after the other, and syncs them. Returns their number.
     ///
     /// # Errors
     /// When the file cannot be synced.

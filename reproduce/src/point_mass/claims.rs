@@ -276,7 +276,8 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
     ]
 }
 
-/// `before` are the results at the end of the first training, `after` those at the end of the additional training.
+/// `before` are the results at the end of the first training, `after` the results at the end of the additional
+/// training.
 pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     let value = |before: &Seed, after: &Seed, measure: Measure| {
         (near_mean(before, measure), mean(near(&after.tests.last), measure))

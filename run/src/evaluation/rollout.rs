@@ -307,8 +307,8 @@ impl RolloutEnvironment {
         }
     }
 
-    /// The picture of the current state, in which `action` will be taken; `None` if there is none. Another program knows
-    /// only the action before, and has written the picture when it reached the state.
+    /// The picture of the current state, in which `action` will be taken; `None` if there is none. Another program
+    /// writes the picture when it reaches the state, so it knows only the action before.
     fn see(&self, action: &[f32]) -> anyhow::Result<Option<Written>> {
         match self {
             Self::Builtin(environment) => {

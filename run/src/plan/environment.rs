@@ -73,7 +73,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
     Ok(description)
 }
 
-/// The error about an environment's own parameters, with the place where the user has set the one at fault.
+/// The error about an environment's own parameters, with the place where the user has set the wrong parameter.
 pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) -> anyhow::Error {
     let Some(of_environment) = error.downcast_ref::<EnvironmentError>() else {
         return error;

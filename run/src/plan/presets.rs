@@ -1,6 +1,6 @@
 //! The built-in configurations: the files of `presets/`.
 //!
-//! A preset has the name of its task. One for another algorithm than the task's first one has the name
+//! A preset has the name of its task. A preset for another algorithm than the task's first has the name
 //! `TASK-ALGORITHM`, and is found by that name.
 
 use shoal_common::config::AlgorithmConfig;

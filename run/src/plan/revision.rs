@@ -38,7 +38,7 @@ pub struct RequestedChanges {
 pub struct Revision {
     /// The configuration from now on.
     pub config: Config,
-    /// Where it differs from what the run was last used with, each with who has changed it.
+    /// The differences from what the run was last used with, each with the file or option that changed it.
     changes: Vec<(Difference, String)>,
     /// Whether `config.toml` says something else.
     rewrite: bool,
