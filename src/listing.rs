@@ -65,7 +65,8 @@ pub(crate) struct ListedRun {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) state: ListedState,
-    /// Why the run is damaged or silent, or what in `config.toml` differs from what the run was last used with.
+    /// Why the run has failed, is damaged or silent; or what in `config.toml` differs from what the run was last used
+    /// with.
     pub(crate) reason: Option<String>,
     pub(crate) environment: String,
     pub(crate) algorithm: String,
@@ -122,15 +123,16 @@ impl ListedRun {
             Ok(None) => {
                 let used = run.config()?;
                 let status = saved_status(&used, run)?;
-                self.state = if status.finished {
-                    ListedState::Finished
+                let failure;
+                (self.state, failure) = if status.finished {
+                    (ListedState::Finished, None)
                 } else {
                     state_after_early_end(run)?
                 };
                 let evaluation = FinalEvaluation::read(run, status.env_steps)?;
                 self.final_return = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
                 self.set_progress(&status);
-                self.reason = plan::edited(run, &used);
+                self.reason = failure.or_else(|| plan::edited(run, &used));
             }
             Err(error) => {
                 self.state = ListedState::Silent;
@@ -169,18 +171,20 @@ fn by_number(a: &str, b: &str) -> Ordering {
     parts(a).cmp(&parts(b)).then_with(|| a.cmp(b))
 }
 
-/// The state of a run that has ended without being finished.
-fn state_after_early_end(run: &RunDir) -> anyhow::Result<ListedState> {
-    Ok(match RunOutcome::read(run)?.map(|outcome| outcome.state) {
-        None => state_from_log(run)?,
-        Some(RunState::Stopped) => ListedState::Stopped,
-        Some(RunState::Failed) => ListedState::Failed,
+/// The state of a run that has ended without being finished, and why it failed, if it did.
+fn state_after_early_end(run: &RunDir) -> anyhow::Result<(ListedState, Option<String>)> {
+    let Some(outcome) = RunOutcome::read(run)? else {
+        return Ok((state_from_log(run)?, None));
+    };
+    Ok(match outcome.state {
+        RunState::Stopped => (ListedState::Stopped, None),
+        RunState::Failed => (ListedState::Failed, outcome.reason.map(String::from)),
         // `Finished` here: a launcher extended the finished run and was killed before it wrote `Running`.
-        Some(RunState::Running | RunState::Finished) => ListedState::Killed,
+        RunState::Running | RunState::Finished => (ListedState::Killed, None),
     })
 }
 
-/// The same for a run of an earlier version, which wrote no outcome: by the last line of its log.
+/// The state of a run of an earlier version, which wrote no outcome: it follows from the last line of the log.
 fn state_from_log(run: &RunDir) -> io::Result<ListedState> {
     let mut file = match File::open(run.log()) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ListedState::New),
@@ -222,6 +226,16 @@ mod tests {
             .map(|run| run.file_name().unwrap().to_str().unwrap())
             .collect();
         assert_eq!(names, ["cart-pole-1", "pendulum-2", "pendulum-10"]);
+    }
+
+    #[test]
+    fn a_failed_run_has_the_reason_of_its_outcome() {
+        let parent = tempfile::tempdir().unwrap();
+        let run = RunDir::create(&parent.path().join("run")).unwrap();
+        let failed = RunOutcome::new(RunState::Failed, 1, 0).with_reason("the disk is full".to_owned());
+        failed.write(&run).unwrap();
+        let expected = (ListedState::Failed, Some("the disk is full".into()));
+        assert_eq!(state_after_early_end(&run).unwrap(), expected);
     }
 
     #[test]

@@ -95,7 +95,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// The error with its causes, except those whose text it already contains.
+/// The error with its causes, except causes whose text it already contains.
 fn with_causes(error: &anyhow::Error) -> String {
     let mut line = error.to_string();
     for cause in error.chain().skip(1).map(ToString::to_string) {

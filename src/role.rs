@@ -21,7 +21,7 @@ use shoal_remote::{
     endpoint::Endpoint,
     files::{HostFile, JoinFile, KeyFile},
 };
-use shoal_run::external_environment::server_location::ServerSurroundings;
+use shoal_run::external_environment::server_location::LaunchContext;
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
 use shoal_run::status::evaluated_period;
 use tracing_subscriber::Layer;
@@ -162,7 +162,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> 
         } else {
             incarnation
         },
-        surroundings: ServerSurroundings::of_run(run, config)?,
+        surroundings: LaunchContext::of_run(run, config)?,
         pictures: None,
         description: None,
     })

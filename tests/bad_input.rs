@@ -221,7 +221,7 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
     ] {
         let output = place.output(&[&["train"], arguments].concat());
         let message = error_line(&output);
-        // A file is no part of the command line.
+        // A file is not part of the command line.
         let expected = if arguments[0].ends_with(".toml") { 1 } else { 2 };
         assert_eq!(output.status.code(), Some(expected), "{arguments:?}: {message}");
         assert!(

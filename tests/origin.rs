@@ -417,7 +417,10 @@ fn a_dataset_that_does_not_fit_is_refused_and_leaves_no_run() {
     );
     std::fs::write(place.path().join("rows"), "something else").unwrap();
     let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
-    assert!(message.contains("python3 has another package shoal"), "{message}");
+    assert!(
+        message.contains("python3 has an incompatible version of the package shoal"),
+        "{message}"
+    );
     std::fs::write(place.path().join("bin/python3"), "#!/bin/sh\nexit 1\n").unwrap();
     let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
     assert!(message.contains("python3 has no package shoal"), "{message}");

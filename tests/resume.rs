@@ -73,7 +73,7 @@ fn a_run_whose_launcher_was_killed_can_be_resumed_at_once() {
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
     for actor in 0..2 {
         let (sent, committed) = (support::sent(&run, actor), support::committed(&run, actor as usize));
-        // Between two launchers an actor's last chunks, those of a few tenths of a second, are not logged.
+        // Between two launchers an actor's last chunks, a few tenths of a second, are not logged.
         assert!(
             (sent..sent + 2000).contains(&committed),
             "actor {actor} sent {sent}, {committed} are there"
@@ -236,7 +236,7 @@ fn a_run_with_a_lost_incarnation_counter_can_be_resumed() {
     for counter in [None, Some("3")] {
         let place = Workplace::new();
         let run = killed(&place, &[]);
-        // Now the replay holds higher incarnations than those of a first start.
+        // Now the replay holds higher incarnations than a first start has.
         resume_to_the_end(&place, 500);
         let file = run.join("incarnations");
         match counter {

@@ -82,7 +82,7 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
     let message = error_line(&place.output(&other));
     assert!(message.contains("suite is a suite of other runs"), "{message}");
 
-    // What takes one run names those of the suite.
+    // A command that takes one run names the runs of the suite.
     for command in [
         &["eval"][..],
         &["film"],
@@ -252,7 +252,7 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
         !std::fs::read_dir(&path).unwrap().flatten().any(is_running)
     });
 
-    // The length of the runs is that of the suite, not the preset's.
+    // The runs have the suite's length, not the preset's.
     let message = error_line(&place.output(&["resume", "suite", "--set", "evaluation.every=1500"]));
     assert!(message.contains("the first evaluation comes after 1500"), "{message}");
     let output = place.output(&["resume", "suite", "--json"]);

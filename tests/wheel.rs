@@ -70,7 +70,7 @@ fn the_wheel_works_without_rust() {
             .args(served)
             .args(["--set", "evaluation.final_episodes=1"]),
     );
-    // Another program in PATH is not that of the package.
+    // Another program in PATH does not replace the package's.
     std::fs::create_dir(here.join("other")).unwrap();
     std::os::unix::fs::symlink("/bin/false", here.join("other/shoal")).unwrap();
     let code = "import shoal; run = shoal.Run('runs/pendulum-1'); print(run.evaluations['return_mean'][-1], \

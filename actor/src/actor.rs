@@ -283,8 +283,8 @@ impl<'a> Actor<'a> {
         Ok(())
     }
 
-    /// Sends the chunk if it is complete, and others that complete transitions fill. Returns false if the environment
-    /// server was lost.
+    /// Sends the chunk if it is complete, and further chunks while complete transitions fill them. Returns false if the
+    /// environment server was lost.
     fn send_complete_chunks(&mut self) -> Result<bool, Exit<ActorError>> {
         loop {
             self.n_step.move_into(&mut self.chunk);
@@ -306,8 +306,8 @@ impl<'a> Actor<'a> {
         self.chunk.is_full() || episode_is_over
     }
 
-    /// Waits for the policy to act with. In lockstep that is the one published after the last round, otherwise the
-    /// newest.
+    /// Waits for the policy to act with. In lockstep that is the policy published after the last round, otherwise the
+    /// newest policy.
     fn await_policy(&mut self) -> Result<Rc<PublishedPolicy>, Exit<ChannelError>> {
         let wanted = match self.settings.config.run.mode {
             Mode::Free => 0,
@@ -321,15 +321,15 @@ impl<'a> Actor<'a> {
             stop,
             ..
         } = self;
-        let newest = |reader: &mut PolicyReader| -> Result<Option<Rc<PublishedPolicy>>, _> {
+        let latest = |reader: &mut PolicyReader| -> Result<Option<Rc<PublishedPolicy>>, _> {
             Ok(reader.latest()?.filter(|policy| policy.header().version >= wanted))
         };
-        let newest = match newest(policy)? {
+        let newest = match latest(policy)? {
             Some(newest) => newest,
             None => wait_for(
                 listener,
                 stop,
-                || newest(policy),
+                || latest(policy),
                 || {
                     heartbeat.beat(Activity::WaitingForPeer);
                     // A restarted learner may need the last chunks before it can publish a policy.
@@ -344,7 +344,7 @@ impl<'a> Actor<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, policy: &PublishedPolicy, current: &EnvironmentResponse) {
         let act = match policy.header().updates {
-            0 if !self.settings.starts_with_learned_policy => Exploration::warm_up,
+            0 if !self.settings.starts_with_learned_policy => Exploration::warmup,
             _ => Exploration::act,
         };
         let steps = StepCounts {

@@ -14,7 +14,7 @@ pub(crate) struct ActorSnapshot {
     pub(crate) exploration: Vec<f64>,
     /// Returns of the current episodes.
     pub(crate) returns: Vec<f64>,
-    /// Their lengths.
+    /// Lengths of the current episodes.
     pub(crate) lengths: Vec<u32>,
     /// The state of [`NStepTransitions`](crate::n_step::NStepTransitions).
     pub(crate) n_step: Vec<u64>,
@@ -41,7 +41,7 @@ impl ActorSnapshot {
     }
 
     /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of
-    /// transitions of several steps; `None` if their count is not that of `layout`.
+    /// transitions of several steps; `None` if `layout` has another number of words.
     pub(crate) fn read(
         words: &[u64],
         layout: &ChunkLayout,

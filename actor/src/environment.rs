@@ -16,7 +16,7 @@ pub const EPISODES_DROPPED: &str = "its episodes are given up";
 /// How long an actor waits after an invalid answer before it begins new episodes.
 const AFTER_FAULT: Duration = Duration::from_millis(50);
 
-/// Connects to environment server `index` and checks that its environments are those of the run's configuration.
+/// Connects to environment server `index` and checks that it serves the environments of the run's configuration.
 pub(crate) fn connect(
     domain: &Domain,
     listener: &Listener,

@@ -27,13 +27,13 @@ pub enum ActorError {
     /// The policy cannot act in this environment.
     #[error(transparent)]
     Actions(#[from] PolicyError),
-    /// The snapshot in the replay is not that of such an actor.
+    /// The snapshot in the replay does not fit the actor.
     #[error("the actor's snapshot in the replay does not fit the run's config.toml; was it edited?")]
     Snapshot,
-    /// The environment server's environments are not those of the run's configuration.
+    /// The environment server serves other environments than the run's configuration has.
     #[error("environment server {index} serves {served}, but the run's config.toml asks for {configured}")]
     Server {
-        /// The server.
+        /// Index of the environment server.
         index: u32,
         /// What it serves.
         served: String,

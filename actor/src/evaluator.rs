@@ -40,7 +40,7 @@ pub struct EvaluatorSettings {
 }
 
 impl EvaluatorSettings {
-    /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous one
+    /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous evaluator
     /// evaluated last.
     pub fn new(config: &Config, run: &RunDir, instance: RoleInstance, evaluated_period: Option<u64>) -> Self {
         Self {
@@ -56,13 +56,13 @@ impl EvaluatorSettings {
 
 /// Decides whether a candidate replaces the best policy. Returns the one to keep, and whether it is the candidate.
 /// Among many policies, some do well on a few episodes by chance. A candidate that seems better than the best must
-/// therefore be better on other episodes too. `confirm` returns the mean return on those, or `None` if nothing is to be
-/// confirmed.
+/// therefore be better on other episodes too. `confirm` returns the mean return on these other episodes, or `None` if
+/// nothing is to be confirmed.
 fn better_of<E>(
-    best: Option<Best>,
-    mut candidate: Best,
+    best: Option<EvaluatedPolicy>,
+    mut candidate: EvaluatedPolicy,
     mut confirm: impl FnMut(&[f32]) -> Result<Option<f64>, E>,
-) -> Result<(Option<Best>, bool), E> {
+) -> Result<(Option<EvaluatedPolicy>, bool), E> {
     if !candidate.mean.is_finite() {
         return Ok((best, false));
     }
@@ -118,21 +118,21 @@ struct Evaluator<'a> {
     actions: Vec<f32>,
     /// The period of the policy evaluated last.
     evaluated_period: Option<u64>,
-    best: Option<Best>,
+    best: Option<EvaluatedPolicy>,
 }
 
-/// The best policy so far.
-struct Best {
+/// A policy with its evaluation.
+struct EvaluatedPolicy {
     /// Its version.
     version: u64,
     /// Mean return of its evaluation; finite.
     mean: f64,
     parameters: Vec<f32>,
-    /// Mean return of the episodes that a better policy is confirmed on, once they were run.
+    /// Mean return on the confirmation episodes; `None` before they are run.
     confirmed: Option<f64>,
 }
 
-impl Best {
+impl EvaluatedPolicy {
     /// A restarted learner may give a version to another policy, so the parameters are compared too.
     fn is_same_policy(&self, other: &Self) -> bool {
         self.version == other.version && self.parameters == other.parameters
@@ -156,8 +156,8 @@ impl<'a> Evaluator<'a> {
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
             let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
-            // Earlier versions may have kept one that diverged.
-            best.return_mean.is_finite().then_some(Best {
+            // Earlier versions may have kept a policy that diverged.
+            best.return_mean.is_finite().then_some(EvaluatedPolicy {
                 version: best.version,
                 mean: best.return_mean,
                 parameters: best.parameters,
@@ -230,7 +230,7 @@ impl<'a> Evaluator<'a> {
     /// Compares this policy with the best one, with further episodes of both if it seems better, and keeps the better
     /// one. Returns whether that is this policy.
     fn replace_if_better(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
-        let candidate = Best {
+        let candidate = EvaluatedPolicy {
             version: published.header().version,
             mean,
             parameters: published.parameters().to_vec(),
@@ -250,7 +250,8 @@ impl<'a> Evaluator<'a> {
         Ok(replaced)
     }
 
-    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on. Returns their returns.
+    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on. Returns the returns of the
+    /// episodes.
     fn returns(&mut self, parameters: &[f32], first: u32, episodes: u32) -> Result<Vec<f64>, Exit<ActorError>> {
         let mut returns = Vec::new();
         while (returns.len() as u32) < episodes {
@@ -283,7 +284,7 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         let due = |header: &PolicyHeader| {
-            evaluated_period.is_none_or(|j| settings.config.evaluation.period(header.env_steps) > j)
+            evaluated_period.is_none_or(|period| settings.config.evaluation.period(header.env_steps) > period)
         };
         let published = wait_for(
             listener,
@@ -301,7 +302,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Runs evaluation episodes with these parameters, from number `first` on: one in each environment, and at most
-    /// `episodes_left`. Returns their returns, or `None` if the server was lost.
+    /// `episodes_left`. Returns the returns of the episodes, or `None` if the server was lost.
     fn run_episodes(
         &mut self,
         parameters: &[f32],
@@ -378,8 +379,8 @@ mod tests {
     use super::*;
 
     /// A policy whose one parameter is its mean return on the episodes that confirm.
-    fn policy(version: u64, mean: f64, confirmed: f32) -> Best {
-        Best {
+    fn policy(version: u64, mean: f64, confirmed: f32) -> EvaluatedPolicy {
+        EvaluatedPolicy {
             version,
             mean,
             parameters: vec![confirmed],
@@ -388,7 +389,7 @@ mod tests {
     }
 
     /// The version that is the best one, whether it is the candidate, and how often something was confirmed.
-    fn decided(best: Option<Best>, candidate: Best) -> (Option<u64>, bool, u32) {
+    fn decided(best: Option<EvaluatedPolicy>, candidate: EvaluatedPolicy) -> (Option<u64>, bool, u32) {
         let mut asked = 0;
         let confirm = |parameters: &[f32]| {
             asked += 1;
@@ -427,7 +428,7 @@ mod tests {
             (Some(1), false, 0),
             "another policy with the version of the best"
         );
-        let known = Some(Best {
+        let known = Some(EvaluatedPolicy {
             confirmed: Some(5.0),
             ..policy(1, 5.0, 5.0)
         });

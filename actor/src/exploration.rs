@@ -18,7 +18,7 @@ pub enum Exploration {
     /// SAC: an action drawn from π(·|s).
     Gaussian(GaussianPolicy, Stream),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
-    Sample(Scores, Stream),
+    Softmax(Scores, Stream),
     /// DQN, Q-learning and SARSA: with probability ε a uniformly random action, otherwise the action with the highest
     /// value, the first among equals (section 3.3.2).
     EpsilonGreedy(Scores, Stream, Epsilon),
@@ -42,7 +42,7 @@ impl Exploration {
                 Self::Noise(network, noise)
             }
             Behaviour::Gaussian(policy) => Self::Gaussian(policy, stream),
-            Behaviour::Sample(scores) => Self::Sample(scores, stream),
+            Behaviour::Softmax(scores) => Self::Softmax(scores, stream),
             Behaviour::EpsilonGreedy(scores, epsilon) => Self::EpsilonGreedy(scores, stream, epsilon),
         }
     }
@@ -52,12 +52,12 @@ impl Exploration {
         match self {
             Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
             Self::Gaussian(policy, _) => PolicyLayout::Gaussian(*policy.layout()),
-            Self::Sample(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
+            Self::Softmax(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
         }
     }
 
     /// Chooses the actions before the policy's first update.
-    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
+    pub fn warmup(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
         match self {
             Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
                 draw_uniformly(noise.stream_at(steps.step), actions, network.range());
@@ -80,7 +80,7 @@ impl Exploration {
                 let stream = seek(stream, step);
                 policy.sample(parameters, observations, || stream.sample(StandardNormal), actions);
             }
-            Self::Sample(logits, stream) => {
+            Self::Softmax(logits, stream) => {
                 let stream = seek(stream, step);
                 for (action, logits) in actions.iter_mut().zip(logits.of(parameters, observations)) {
                     *action = draw(logits, stream.random()) as f32;
@@ -112,7 +112,7 @@ impl Exploration {
     pub(crate) fn state(&self) -> &[f64] {
         match self {
             Self::Noise(_, noise) => noise.state(),
-            Self::Gaussian(..) | Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
+            Self::Gaussian(..) | Self::Softmax(..) | Self::EpsilonGreedy(..) => &[],
         }
     }
 
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn warm_up_actions_may_be_uniform_over_their_range_and_depend_only_on_the_step() {
+    fn warmup_actions_may_be_uniform_over_their_range_and_depend_only_on_the_step() {
         let spec = EnvironmentSpec {
             observation: Space::boxed(&[(-1.0, 1.0)]),
             action: Space::boxed(&[(-2.0, 2.0), (0.0, 8.0)]),
@@ -254,11 +254,11 @@ mod tests {
             act(exploration, &parameters, &[0.5], at(step), &mut action);
             action
         };
-        let (warm_up, act): (Act, Act) = (Exploration::warm_up, Exploration::act);
+        let (warmup, act): (Act, Act) = (Exploration::warmup, Exploration::act);
 
         let mut uniform = new(Warmup::Uniform);
-        let warm: Vec<_> = (0..1_000).map(|step| choose(&mut uniform, warm_up, step)).collect();
-        assert_eq!(choose(&mut uniform, warm_up, 77), warm[77]);
+        let warm: Vec<_> = (0..1_000).map(|step| choose(&mut uniform, warmup, step)).collect();
+        assert_eq!(choose(&mut uniform, warmup, 77), warm[77]);
         for (element, (low, high)) in [(-2.0, 2.0), (0.0, 8.0)].into_iter().enumerate() {
             let quarter_of = |action: &[f32; 2]| ((action[element] - low) / (high - low) * 4.0) as usize;
             for quarter in 0..4 {
@@ -274,10 +274,10 @@ mod tests {
             AlgorithmConfig::Td3(Td3Config::default()),
             AlgorithmConfig::Sac(SacConfig::default()),
         ] {
-            assert_eq!(choose(&mut new_for(algorithm), warm_up, 77), warm[77]);
+            assert_eq!(choose(&mut new_for(algorithm), warmup, 77), warm[77]);
         }
         let mut with_policy = new(Warmup::Policy);
-        let noisy = choose(&mut with_policy, warm_up, 0);
+        let noisy = choose(&mut with_policy, warmup, 0);
         assert_eq!(
             choose(&mut uniform, act, 0),
             noisy,

@@ -40,7 +40,7 @@ impl NStepTransitions {
         let steps = &mut self.pending[environment];
         steps.push_back(row);
         while steps.len() == self.n || (step.last && !steps.is_empty()) {
-            self.complete.push_back(of_several(self.row, steps));
+            self.complete.push_back(n_step_row(self.row, steps));
             steps.pop_front();
         }
     }
@@ -49,7 +49,7 @@ impl NStepTransitions {
     pub fn complete_all(&mut self) {
         for steps in &mut self.pending {
             while !steps.is_empty() {
-                self.complete.push_back(of_several(self.row, steps));
+                self.complete.push_back(n_step_row(self.row, steps));
                 steps.pop_front();
             }
         }
@@ -122,10 +122,10 @@ impl NStepTransitions {
 }
 
 /// The transition that begins with the first of these steps and ends with the last: r = r₁ + d₁ (r₂ + d₂ (…)), and the
-/// discount d₁ d₂ …, where dᵢ is a step's own discount. `last` is that of the first step, so that an episode has one
+/// discount d₁ d₂ …, where dᵢ is a step's own discount. `last` is taken from the first step, so that an episode has one
 /// row with it.
-fn of_several(row: RowLayout, steps: &VecDeque<Vec<f32>>) -> Vec<f32> {
-    let mut of_all = vec![0.0; row.width()];
+fn n_step_row(row: RowLayout, steps: &VecDeque<Vec<f32>>) -> Vec<f32> {
+    let mut numbers = vec![0.0; row.width()];
     if let (Some(first), Some(end)) = (steps.front(), steps.back()) {
         let (mut r, mut discount) = (0.0, 1.0);
         for step in steps {
@@ -139,9 +139,9 @@ fn of_several(row: RowLayout, steps: &VecDeque<Vec<f32>>) -> Vec<f32> {
             s_next: row.read(end).s_next,
             ..row.read(first)
         };
-        row.write(&transition, &mut of_all);
+        row.write(&transition, &mut numbers);
     }
-    of_all
+    numbers
 }
 
 #[cfg(test)]

@@ -38,7 +38,7 @@ impl OrnsteinUhlenbeck {
         &self.x
     }
 
-    /// Continues from these states. Panics if their number is not that of `state`.
+    /// Continues from these states. Panics unless there are as many as in `state`.
     pub(crate) fn restore(&mut self, state: &[f64]) {
         self.x.copy_from_slice(state);
     }

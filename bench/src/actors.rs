@@ -1,6 +1,6 @@
 //! How the rate of environment steps grows with the number of actors, from the environments to the committed replay.
-//! The processes are those of a run, without launcher and evaluator. A queueing model predicts the rates on this
-//! machine and on one with a core for every process.
+//! The processes are a run's, without launcher and evaluator. A queueing model predicts the rates on this machine and
+//! on one with a core for every process.
 
 use std::time::{Duration, Instant};
 
@@ -66,7 +66,7 @@ struct Count {
 struct Rate {
     rows_per_second: f64,
     updates_per_second: f64,
-    /// The rate divided by that of one actor times the number of actors.
+    /// The rate divided by (the rate of one actor × the number of actors).
     efficiency: f64,
     expected_rows_per_second: f64,
     expected_updates_per_second: f64,
@@ -131,7 +131,7 @@ pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Resul
     };
     let [first, first_learning] = match counted.first() {
         Some((_, collecting, learning)) => [collecting.0.median(), learning.0.median()],
-        None => bail!("nothing was counted"),
+        None => bail!("no number of actors was measured"),
     };
     let counts = counted.into_iter().map(|(actors, collecting, learning)| {
         let rate = |(results, updates): (Samples, f64), one: f64, with_updates| {

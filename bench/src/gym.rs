@@ -87,7 +87,10 @@ fn times(
 }
 
 fn gymnasium(environment: &EnvironmentConfig, length: Duration) -> anyhow::Result<Gymnasium> {
-    let python = environment.server.first().context("no Python")?;
+    let python = environment
+        .server
+        .first()
+        .context("the environment has no server: `gym:` environments need a Python with ./python installed")?;
     let output = Command::new(python)
         .args(["-m", "shoal_gym.peers", "--name", NAME])
         .args(["--environments", &ENVIRONMENTS.to_string()])

@@ -148,7 +148,9 @@ fn filled(config: &Config, mut replay: Replay, budget: &TimeBudget) -> anyhow::R
             incarnation: 0,
             sequence,
         };
-        replay.append_and_commit(0, id, &chunk).context("the replay")?;
+        replay
+            .append_and_commit(0, id, &chunk)
+            .context("cannot fill the replay")?;
     }
     Ok(replay)
 }

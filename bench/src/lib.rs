@@ -30,7 +30,7 @@ use shoal_run::usage::UsageError;
 
 use self::measurement::{TimeBudget, print};
 
-/// The algorithms that [`Stage::Learner`] can measure: those that learn from minibatches.
+/// The algorithms that [`Stage::Learner`] can measure, which learn from minibatches.
 pub fn algorithms() -> impl Iterator<Item = &'static str> {
     AlgorithmConfig::of_minibatches().map(|algorithm| algorithm.name())
 }
@@ -62,7 +62,7 @@ pub enum Stage {
 }
 
 /// Measures a stage and prints the result, as a table or with `json` also as one JSON object. `actors` lists the
-/// numbers of actors that [`Stage::Actors`] measures, `algorithm` is that of [`Stage::Learner`].
+/// numbers of actors that [`Stage::Actors`] measures, `algorithm` is what [`Stage::Learner`] measures.
 ///
 /// # Errors
 /// If a measured process fails, or the user interrupts.

@@ -22,7 +22,7 @@ const DEFAULT_SECONDS: f64 = 6.0;
 /// The error message after the user interrupted.
 pub(super) const INTERRUPTED: &str = "interrupted";
 
-/// The result of a stage. Its serialized fields are those of `--json`.
+/// The result of a stage. Its serialized fields are the fields of `--json`.
 pub(super) trait Figures: Serialize {
     /// The result for the user: pairs of a name and a value.
     fn lines(&self) -> Vec<(&'static str, String)>;

@@ -44,7 +44,7 @@ impl Memory {
             let mut words = line.split_ascii_whitespace();
             let Some(first) = words.next() else { continue };
             let Some(field) = first.strip_suffix(':') else {
-                // Addresses, rights, offset, device, inode and name.
+                // Addresses, permissions, offset, device, inode and name.
                 let name = words.skip(4).collect::<Vec<_>>().join(" ");
                 kind = match name.as_str() {
                     name if name == replay => Kind::Replay,

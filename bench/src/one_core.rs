@@ -1,5 +1,5 @@
 //! The share of a core that an actor leaves to its policy. An actor and its environment server share one core, and
-//! their rate is compared with that of the policy alone on this core. The two measurements alternate, so that a
+//! their rate is compared with the rate of the policy alone on this core. The two measurements alternate, so that a
 //! disturbance affects both.
 
 use std::time::{Duration, Instant};

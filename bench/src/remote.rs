@@ -141,7 +141,7 @@ struct ManyFigures {
     hosts: u32,
     actors: u32,
     rows_per_second: f64,
-    /// Rows of the slowest host divided by those of the fastest.
+    /// Rows of the slowest host divided by rows of the fastest.
     fairness: f64,
     gate_open_files: usize,
     gate_private_bytes: u64,
@@ -323,7 +323,7 @@ fn predict(
     })
 }
 
-/// Chunks a second of a host's actors, each of which needs `think` to fill one.
+/// Chunks a second of a host's actors if each actor needs `think` to fill a chunk.
 fn chunks_per_second_at_pace(
     network: &Network,
     actors: u32,

@@ -22,7 +22,7 @@ use super::temporary_run::TemporaryRun;
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Share of the time that is spent on warming up.
-const WARM_UP: f64 = 0.1;
+const WARMUP: f64 = 0.1;
 
 /// Shares of the time: round trips between two cores, and within one.
 const SHARES: [f64; 2] = [0.6, 0.3];
@@ -110,7 +110,7 @@ fn round_trips(
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
-    let warm_up = length.mul_f64(WARM_UP);
+    let warmup = length.mul_f64(WARMUP);
     let (begun, mut looked) = (Instant::now(), Instant::now());
     loop {
         let before = Instant::now();
@@ -124,7 +124,7 @@ fn round_trips(
             Err(Exit::Failed(error)) => return Err(error.into()),
         }
         let after = Instant::now();
-        if before.duration_since(begun) >= warm_up {
+        if before.duration_since(begun) >= warmup {
             times.push((after - before).as_nanos().try_into().unwrap_or(u32::MAX));
         }
         if after - looked >= CHECK_INTERVAL {

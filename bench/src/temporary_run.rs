@@ -1,12 +1,13 @@
-//! The run that is measured: the preset `pendulum` in a temporary directory.
+//! The run that is measured: a preset in a temporary directory, `pendulum` unless the algorithm cannot control it.
 
 use anyhow::Context;
 use rustix::thread::CpuSet;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::commit::ReplayLayout;
-use shoal_common::config::{Config, DdpgConfig};
+use shoal_common::config::{AlgorithmConfig, Config, DdpgConfig};
 use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
+use shoal_env_server::environment::make;
 use shoal_run::child_process::ChildProcess;
 use shoal_run::plan::Plan;
 use shoal_run::plan::RunOverrides;
@@ -14,6 +15,9 @@ use shoal_run::preflight;
 use tempfile::TempDir;
 
 use super::processes::Processes;
+
+/// Environments and their presets: one with continuous actions, one with discrete actions.
+const TASKS: [&str; 2] = ["pendulum", "cart-pole"];
 
 /// A run whose directory is removed when this is dropped.
 #[derive(Debug)]
@@ -34,13 +38,18 @@ impl TemporaryRun {
         Self::of(1, 1, set)
     }
 
-    /// The preset for an algorithm, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
+    /// A preset with this algorithm, by default the preset's own, with one actor and one environment: the first of
+    /// [`TASKS`] that the algorithm can control.
     pub(super) fn with_algorithm(algorithm: Option<&str>) -> anyhow::Result<Self> {
-        let preset = if algorithm == Some("dqn") {
-            "cart-pole"
-        } else {
-            "pendulum"
+        let named = AlgorithmConfig::all()
+            .into_iter()
+            .find(|known| Some(known.name()) == algorithm);
+        let controls = |task: &&str| {
+            named.as_ref().is_none_or(|algorithm| {
+                make(task, &toml::Table::new()).is_ok_and(|made| algorithm.check_spaces(&made.spec()).is_ok())
+            })
         };
+        let preset = TASKS.into_iter().find(controls).unwrap_or(TASKS[0]);
         let overrides = RunOverrides {
             algorithm: algorithm.map(Into::into),
             actors: Some(1),
@@ -156,7 +165,7 @@ pub(super) const UNDISTURBED: [&str; 2] = ["run.steps=1_000_000_000_000", "check
 /// Assignments for a run whose steps are counted.
 pub(super) fn settings_for_counting(actors: u32, updates: bool) -> Vec<&'static str> {
     let mut settings = UNDISTURBED.to_vec();
-    // The model's cost of a gradient step is that of one thread.
+    // The model's cost of a gradient step is measured on one thread.
     settings.push("learner.threads=1");
     if actors > 16 {
         settings.push("actors.max=256");

@@ -95,10 +95,10 @@ fn move_rows(
         })
         .map_err(super::measurement::interrupted)?;
 
-    let [warm_up, moving, _] = SHARES;
+    let [warmup, moving, _] = SHARES;
     let mut results = Samples::default();
     let mut left = intervals::count(budget.length, moving, INTERVAL);
-    let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warm_up), None);
+    let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warmup), None);
     loop {
         for numbers in &chunks {
             let may_send = || sender.in_flight(commits.committed(0)) < u64::from(config.actors.window);

@@ -72,16 +72,16 @@ pub enum ConfigError {
     /// The file could not be read.
     #[error("cannot read {path}: {cause}")]
     Unreadable {
-        /// The file.
+        /// The configuration file.
         path: PathBuf,
         /// The system's reason.
         cause: std::io::Error,
     },
     /// The text is not a configuration.
-    #[error("{origin}: {message}")]
+    #[error("{}{message}", origin.as_ref().map(|origin| format!("{origin}: ")).unwrap_or_default())]
     Malformed {
-        /// Where the text came from.
-        origin: String,
+        /// Where the text came from, if it has a name.
+        origin: Option<String>,
         /// What is wrong with it, on one line.
         message: String,
     },
@@ -97,9 +97,9 @@ pub enum ConfigError {
     /// The algorithm does not fit the environment.
     #[error("{algorithm} cannot control {environment}: {cause}; choose {fitting}")]
     Control {
-        /// The algorithm.
+        /// Name of the algorithm.
         algorithm: &'static str,
-        /// The environment.
+        /// Name of the environment.
         environment: String,
         /// What does not fit.
         cause: PolicyError,
@@ -129,9 +129,21 @@ impl Config {
     /// # Errors
     /// When a key is unknown, of the wrong type, or out of range.
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
+        Self::read(&table, Some(&origin))
+    }
+
+    /// Reads a configuration from sections that were put together. Errors name no origin.
+    ///
+    /// # Errors
+    /// As for [`from_table`](Self::from_table).
+    pub fn from_settings(table: &toml::Table) -> Result<Self, ConfigError> {
+        Self::read(table, None)
+    }
+
+    fn read(table: &toml::Table, origin: Option<&dyn Display>) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
-            origin: origin.to_string(),
-            message: sections::first_unreadable(&table).unwrap_or_else(|| one_line(error.message())),
+            origin: origin.map(ToString::to_string),
+            message: sections::first_unreadable(table).unwrap_or_else(|| one_line(error.message())),
         })?;
         config.check()?;
         Ok(config)
@@ -143,7 +155,7 @@ impl Config {
     /// When a value cannot be written as TOML (a seed beyond 2⁶³).
     pub fn to_toml(&self) -> Result<String, ConfigError> {
         toml::to_string(self).map_err(|error| ConfigError::Malformed {
-            origin: "configuration".into(),
+            origin: Some("configuration".into()),
             message: error.to_string(),
         })
     }

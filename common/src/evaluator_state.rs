@@ -15,7 +15,7 @@ const KIND: FileKind = FileKind {
     name: "an evaluator's state",
 };
 
-/// The newest evaluations of a run: at least those that the launcher may not have received yet.
+/// The newest evaluations of a run, at least all that the launcher may not have received yet.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EvaluatorState {
     evaluations: VecDeque<EvaluationReport>,
@@ -43,7 +43,10 @@ impl EvaluatorState {
             Ok(bytes) => bytes,
             Err(SealError::Io(cause)) if cause.kind() == io::ErrorKind::NotFound => return Ok(Self::default()),
             Err(SealError::Checksum) => {
-                tracing::warn!("{} is damaged: starting with an empty one", path.display());
+                tracing::warn!(
+                    "{} is damaged; the evaluator starts without saved evaluations",
+                    path.display()
+                );
                 return Ok(Self::default());
             }
             Err(cause) => return Err(failed(cause)),

@@ -1,6 +1,6 @@
 //! Everything that crosses a process boundary of Shoal, or is shared by all roles.
 //!
-//! Its layers are packages, each of which imports those above it in this list:
+//! Its layers are packages. Each imports the packages above it in this list:
 //!
 //! | package | contents |
 //! | --- | --- |

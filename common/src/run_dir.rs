@@ -40,9 +40,9 @@ pub enum RunDirError {
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
     Io {
-        /// What was tried.
+        /// What was tried, as a verb.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
         /// The system's reason.
         cause: io::Error,
@@ -70,7 +70,7 @@ fn suite(path: &Path) -> String {
     runs.sort_by(|a, b| (a.len(), a).cmp(&(b.len(), b)));
     let here = path.display();
     let Some(first) = runs.first() else {
-        return format!("it is a suite of runs, of which none has begun: shoal resume {here}");
+        return format!("it is a suite, and none of its runs has begun: shoal resume {here}");
     };
     let shown = runs.iter().take(SHOWN).cloned().collect::<Vec<_>>().join(", ");
     let others = match runs.len().saturating_sub(SHOWN) {
@@ -269,7 +269,7 @@ impl RunDir {
             id: id_of(&file.metadata().map_err(io)?),
             _directory: file,
         };
-        // Its last owner may have removed it meanwhile.
+        // Before the lock was taken, its last owner may have removed it.
         if locked.is_elsewhere() {
             return Err(RunDirError::Gone(self.path.clone()));
         }
@@ -313,7 +313,7 @@ impl RunDir {
         if used.exists() {
             Config::load(&used)
         } else {
-            // A run of an earlier version, or one that has just been made.
+            // A run of an earlier version, or a run that has just been made.
             Config::load(&self.config_file())
         }
     }

@@ -50,7 +50,7 @@ impl Description {
         }
     }
 
-    /// Describes an environment of which only the spaces are known.
+    /// Describes an environment if only its spaces are known.
     pub fn by_number(spec: &EnvironmentSpec) -> Self {
         Self {
             signals: Signal::by_number(spec),

@@ -1,4 +1,4 @@
-//! The environment server's loop: answers one actor's requests by stepping its environments.
+//! The environment server's loop: answers the requests of one client by stepping its environments.
 
 use shoal_base::role::Activity;
 use shoal_base::stop::Stop;

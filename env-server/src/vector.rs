@@ -17,8 +17,8 @@ const EPISODE_BITS: u32 = 40;
 /// `count` environments of one kind, each in its own episode.
 ///
 /// All random numbers of training episode k of environment e come from stream (e, k) of `stream(seed, Environment,
-/// server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an episode does not
-/// depend on what was run before it.
+/// server, incarnation)`, all random numbers of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an
+/// episode does not depend on what was run before it.
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,

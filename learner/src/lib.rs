@@ -1,7 +1,7 @@
 //! The learner: its networks ([`networks`]), the replay ([`replay`]), the learning algorithms ([`algorithms`]) and the
-//! process that runs them ([`process`]). Each of these modules imports only from those named before it.
+//! process that runs them ([`process`]). Each of these modules imports only from those listed before it.
 //!
-//! The way of a transition, from an actor through shared memory into the replay:
+//! The path of a transition, from an actor through shared memory into the replay:
 //!
 //! ```
 //! use shoal_common::channel::transitions::{ChunkReceiver, ChunkSender};

@@ -30,10 +30,10 @@
 //! ```
 
 mod append;
-mod begin;
 mod check;
 mod error;
 mod file;
+mod initial_rows;
 mod recovery;
 mod ring;
 mod step;

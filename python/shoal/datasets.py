@@ -90,7 +90,7 @@ def to_minari(
                 action_space=spaces["action"],
             )
         except BaseException as error:
-            # Half a dataset would be in the way of the next attempt. One that was made meanwhile is somebody else's.
+            # Half a dataset would block the next attempt. A dataset that another process has made is kept.
             if "already exists" not in str(error):
                 shutil.rmtree(minari.storage.get_dataset_path(dataset_id), ignore_errors=True)
             raise

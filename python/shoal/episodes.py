@@ -39,7 +39,7 @@ class Ambiguous(Exception):
 
 
 def episodes(run: Run) -> Episodes:
-    """The episodes in the run's replay, exactly as they were. The run may continue meanwhile.
+    """The episodes in the run's replay, exactly as they were. The run may continue.
 
     Raises :class:`ShoalError` where the rows do not say what belongs together: with ``replay.n_step`` above 1, with a γ
     of 0, and where two environments were at the same observation.

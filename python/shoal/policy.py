@@ -77,7 +77,7 @@ class Policy:
             weights, biases = parameters[place:][: inputs * units], parameters[place + inputs * units :][:units]
             place += (inputs + 1) * units
             if place <= len(parameters):
-                # In the file, the weights of one input follow those of another.
+                # In the file, the weights of an input are consecutive.
                 self._layers.append((weights.reshape(inputs, units), biases))
         if config.get("observation", {}).get("normalise", False):
             mean, factor = parameters[place:][: sizes[0]], parameters[place + sizes[0] :][: sizes[0]]

@@ -30,7 +30,7 @@ TEXT: Any = {"encoding": "utf-8", "errors": "replace"}
 
 
 def program() -> str:
-    """The path of the program: ``$SHOAL``, else that of this installation if a wheel brought one, else ``shoal`` in
+    """The path of the program: ``$SHOAL``, else this installation's if a wheel brought one, else ``shoal`` in
     ``PATH``, else beside the Python interpreter."""
     named = os.environ.get("SHOAL")
     beside = Path(sys.executable).parent / "shoal"
@@ -156,7 +156,7 @@ def train(
     """Trains ``what``: a preset (``"pendulum"``), an environment (``"gym:Pendulum-v1"``) or a configuration file.
 
     ``set`` has settings by their keys, as in ``{"ddpg.tau": 0.005}``; ``shoal train --help-config`` lists them. Values
-    may be numpy's. The other arguments are those of ``shoal train``. ``run`` is the directory to create, by default
+    may be numpy's. The other arguments are the options of ``shoal train``. ``run`` is the directory to create, by default
     ``runs/<what>-<n>``.
 
     With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
@@ -199,7 +199,7 @@ def train_suite(
     as in ``{"ddpg.tau": [0.001, 0.005]}``. Returns it when all its runs have been trained.
 
     ``halving`` ends bad settings early. ``jobs`` is the number of runs at a time, by default what the machine allows.
-    The other ``options`` are those of :func:`train`, except ``seed`` and ``wait``, and all runs have them. ``run`` is
+    The other ``options`` are the arguments of :func:`train`, except ``seed`` and ``wait``, and all runs have them. ``run`` is
     the directory of the suite. Called again with the same options, this continues a suite that was interrupted.
 
     Raises :class:`ShoalError` if the program refuses, or a run fails.

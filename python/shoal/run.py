@@ -112,7 +112,7 @@ class Run:
         The dataset has every row that the run collected itself and the ring still has, unchanged, in the environment's
         units: boxes as float32, discrete observations and actions as the environment's integers. Rows with which the
         run began (``with_replay``, demonstrations) are left out. An episode whose beginning was overwritten begins
-        later. One that was cut ends neither terminated nor truncated.
+        later. An episode that was cut ends neither terminated nor truncated.
 
         This needs minari, h5py and pillow. Raises :class:`ShoalError` for a replay that has no steps of the environment
         (``replay.n_step``, a γ of 0), and where episodes of several actors cannot be told apart.
@@ -174,6 +174,6 @@ class Run:
         return self
 
     def evaluate(self, episodes: int | None = None) -> dict[str, Any]:
-        """Evaluates the best policy anew, as ``shoal eval --json`` does."""
+        """Evaluates the best policy again, as ``shoal eval --json`` does."""
         options = ["--episodes", str(episodes)] if episodes is not None else []
         return json.loads(program.call(["eval", self.path, "--json", *options]))

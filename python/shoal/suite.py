@@ -34,7 +34,7 @@ class Suite:
     @property
     def trials(self) -> list[dict[str, Any]]:
         """All its runs, begun or not, in their order: ``name`` is the name of a run's directory, ``seed`` its seed
-        (``None``: that of the preset), ``set`` a list of what it has of its own, each as ``"SECTION.KEY=VALUE"``."""
+        (``None``: the preset's), ``set`` a list of what it has of its own, each as ``"SECTION.KEY=VALUE"``."""
         file = self.path / "suite.json"
         try:
             return [

@@ -180,13 +180,13 @@ def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", foll
             time.sleep(POLL_SECONDS)
     finally:
         with contextlib.ExitStack() as closing:
-            # One that fails does not keep the others open.
+            # A tracker that fails does not keep the others open.
             for copy in tracked.values():
                 closing.callback(copy.close)
 
 
 def runs(path: Path) -> list[Run]:
-    """The run of this directory, or those of this suite that have begun."""
+    """The run of this directory, or the runs of this suite that have begun."""
     return Suite(path).runs if (path / "suite.json").is_file() else [Run(path)]
 
 

@@ -46,7 +46,7 @@ class Batch:
 
 
 class Transitions:
-    """The replay of a run, mapped read-only. The learner may be adding transitions meanwhile.
+    """The replay of a run, mapped read-only. The learner may be adding transitions.
 
     Row ``i`` stands in place ``i % ring`` of a ring, whose oldest rows are overwritten. :attr:`rows` says which are
     valid at this moment. Views (:meth:`view`) are not copied, so the learner may overwrite them: look at :attr:`rows`
@@ -82,7 +82,7 @@ class Transitions:
             generation = int(self._words[published])
             slot = (2 * BLOCK + self._slot * (generation % 2)) // 8
             record = self._words[slot : slot + words].copy()
-            # The slot was not written meanwhile if the same generation is published.
+            # If the same generation is still published, the slot was not written.
             if int(self._words[published]) == generation:
                 return record
 

@@ -21,7 +21,7 @@ BEAT = 0.5
 """Seconds between heartbeats."""
 
 PROVEN = 1000
-"""A server that has taken this many environment steps is able to work: one that fails later is started again and again."""
+"""A server that has taken this many environment steps is able to work: if it fails later, it is started again each time."""
 
 PATIENCE = 10.0
 """Seconds for which a port may be refused: a predecessor that was killed has it until the launcher has cleaned up."""
@@ -138,7 +138,7 @@ class Port:
             self._listener.timed_wait(iox2.Duration.from_secs_f64(SLEEP))
 
     def notify(self) -> None:
-        """Wakes the client. One that is not there looks for itself when it comes."""
+        """Wakes the client. A client that is not there looks for itself when it comes."""
         try:
             self._notifier.notify()
         except iox2.NotifierNotifyError:
@@ -146,7 +146,7 @@ class Port:
 
     def begin_work(self) -> None:
         """Says that the environments are about to do something that this process may not survive; at once, where they have
-        not made a step yet. So the launcher tells a process that dies over its first step from one that was waiting."""
+        not made a step yet. So the launcher distinguishes a process that dies in its first step from a process that was waiting."""
         if self._heartbeat.steps == 0:
             self._beaten = -BEAT
             self.beat(Activity.WORKING)

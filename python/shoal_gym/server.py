@@ -1,4 +1,4 @@
-"""The server's loop: answers one actor's requests by stepping its environments."""
+"""The server's loop: answers the requests of one client by stepping its environments."""
 
 import ctypes
 import sys

@@ -257,7 +257,7 @@ mod tests {
 
 #[cfg(test)]
 mod tests_support {
-    //! Configurations of every algorithm and of some variants, with policies that are no special case.
+    //! Configurations of every algorithm and of some variants, with policies that are not special cases.
 
     use shoal_env_server::environment::make;
     use shoal_run::plan::{RunOverrides, algorithm, resolve};

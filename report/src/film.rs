@@ -5,7 +5,7 @@ mod ffmpeg;
 mod paint;
 
 use std::borrow::Cow;
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
@@ -38,7 +38,7 @@ const PAUSE: f64 = 0.6;
 
 /// Steps in a second where nothing says how many there are.
 const STEPS_PER_SECOND: f64 = 30.0;
-/// The same where the states are places, such as cells of a grid.
+/// Steps in a second where the states are places, such as cells of a grid.
 const MOVES_PER_SECOND: f64 = 4.0;
 
 /// The file formats.
@@ -97,6 +97,28 @@ pub struct Shown {
     pub seconds: f64,
 }
 
+/// Why there is no film: its file cannot be written, or something else.
+enum FilmFailure {
+    File(anyhow::Error),
+    Other(anyhow::Error),
+}
+
+impl From<io::Error> for FilmFailure {
+    fn from(error: io::Error) -> Self {
+        Self::File(error.into())
+    }
+}
+
+impl From<anyhow::Error> for FilmFailure {
+    fn from(error: anyhow::Error) -> Self {
+        if error.is::<gif::EncodingError>() {
+            Self::File(error)
+        } else {
+            Self::Other(error)
+        }
+    }
+}
+
 /// Plays the episodes and writes their film to `out`, whole or not at all. Calls `progress` with the number of the
 /// episode, counted from 0, and the number of its steps.
 ///
@@ -121,51 +143,44 @@ pub fn film(
     };
     let most = (pictures / request.episodes.max(1) as usize).max(FEWEST_PICTURES);
     let mut shown = Shown::default();
-    let cannot_write = || format!("cannot write {}; choose another place with --out", out.display());
-    let mut wrote = Ok(());
-    let published = write_atomically(out, |file| {
-        wrote = (|| {
-            let mut writer: Option<Writer<'_, _>> = None;
-            let mut file = Some(file);
-            for number in 0..request.episodes {
-                let steps = |steps| progress(number, steps);
-                let (trajectory, frames) = rollout.filmed_episode((request.seed, number.into()), most, steps)?;
-                let name = &config.environment.name;
-                let frames = frames.map_err(|reason| anyhow::anyhow!("{name} cannot be filmed: {reason}"))?;
-                let rate = request
-                    .steps_per_second
-                    .or(time_step.map(f64::recip))
-                    .or(frames.fps)
-                    .unwrap_or(match config.spec.observation {
-                        Space::Discrete { .. } => MOVES_PER_SECOND,
-                        Space::Box { .. } => STEPS_PER_SECOND,
-                    });
-                let steps = trajectory.actions.len();
-                let images = images(&frames, request.height)?;
-                let size = (images[0].width, images[0].height);
-                let writer = match &mut writer {
-                    Some(writer) => writer,
-                    None => {
-                        let file = file.take().context("the film was begun twice")?;
-                        writer.insert(Writer::new(file, format, size, rate)?)
-                    }
-                };
-                shown.seconds += writer.add(&images, frames.stride, steps, rate, interrupt)?;
-                shown.episodes.push((trajectory.episode_return(), steps));
-            }
-            writer.context("there is no episode")?.finish(interrupt)
-        })();
-        // What failed was not the file: it is returned as it is.
-        match &wrote {
-            Ok(()) => Ok(()),
-            Err(_) => Err(std::io::Error::other("no film")),
+    write_atomically(out, |file| {
+        let mut writer: Option<Writer<'_, _>> = None;
+        let mut file = Some(file);
+        for number in 0..request.episodes {
+            let steps = |steps| progress(number, steps);
+            let (trajectory, frames) = rollout.filmed_episode((request.seed, number.into()), most, steps)?;
+            let name = &config.environment.name;
+            let frames = frames.map_err(|reason| anyhow::anyhow!("{name} cannot be filmed: {reason}"))?;
+            let rate = request
+                .steps_per_second
+                .or(time_step.map(f64::recip))
+                .or(frames.fps)
+                .unwrap_or(match config.spec.observation {
+                    Space::Discrete { .. } => MOVES_PER_SECOND,
+                    Space::Box { .. } => STEPS_PER_SECOND,
+                });
+            let steps = trajectory.actions.len();
+            let images = images(&frames, request.height)?;
+            let size = (images[0].width, images[0].height);
+            let writer = match &mut writer {
+                Some(writer) => writer,
+                None => {
+                    let file = file.take().context("the film was begun twice")?;
+                    writer.insert(Writer::new(file, format, size, rate)?)
+                }
+            };
+            shown.seconds += writer.add(&images, frames.stride, steps, rate, interrupt)?;
+            shown.episodes.push((trajectory.episode_return(), steps));
         }
-    });
-    wrote.map_err(|error| match error.is::<gif::EncodingError>() {
-        true => error.context(cannot_write()),
-        false => error,
+        Ok(writer.context("there is no episode")?.finish(interrupt)?)
+    })
+    .map_err(|failure| match failure {
+        FilmFailure::File(error) => error.context(format!(
+            "cannot write {}; choose another place with --out",
+            out.display()
+        )),
+        FilmFailure::Other(error) => error,
     })?;
-    published.with_context(cannot_write)?;
     Ok(shown)
 }
 

@@ -27,7 +27,7 @@ pub const MARK: &str = "<!doctype html>\n<!-- made by shoal report -->\n";
 
 const PAGE: &str = include_str!("page/page.html");
 const STYLE: &str = include_str!("page/page.css");
-/// In dependency order: a script uses only those before it.
+/// In dependency order: a script uses only earlier scripts.
 const SCRIPTS: [&str; 10] = [
     include_str!("page/dom.js"),
     include_str!("page/axis.js"),
@@ -47,7 +47,7 @@ pub struct Report {
     version: &'static str,
     /// Seconds since 1970.
     made: u64,
-    /// The start of the suite whose runs these are; `None` if they are not exactly those of one suite.
+    /// The start of the suite whose runs these are; `None` if they are not exactly the runs of one suite.
     suite: Option<StartRecord>,
     runs: Vec<Run>,
     comparisons: Vec<Comparison>,

@@ -19,7 +19,7 @@ use crate::figure;
 /// The figures of a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Drawn {
-    /// Their files.
+    /// The files of the figures.
     pub files: Vec<PathBuf>,
     /// Why an episode is missing among them: a sentence without its full stop. The program that serves the environment
     /// has failed.
@@ -41,7 +41,7 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interr
     if !run.best_policy().exists() {
         return Ok(drawn);
     }
-    if config.environment.server.is_empty() {
+    if !config.environment.is_external() {
         drawn.files.extend(behaviour(run, config, out)?);
     } else if let Some(interrupt) = interrupt
         && let Some(description) = description::kept(run, config)?

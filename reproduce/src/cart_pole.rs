@@ -141,7 +141,7 @@ impl TrainingHistory {
 pub(super) struct CartPole;
 
 impl Family for CartPole {
-    type Tests = TrainingHistory;
+    type Measurements = TrainingHistory;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
     fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<TrainingHistory> {

@@ -106,7 +106,7 @@ impl Experiment {
         }
     }
 
-    /// The length of a finished run: that of its last stage.
+    /// The length of a finished run, which is the length of its last stage.
     pub(super) fn length(&self, effort: Effort) -> Option<Length> {
         self.stages.last().map(|stage| stage.length(effort))
     }

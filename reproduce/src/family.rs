@@ -19,16 +19,16 @@ use super::settings::RunSettings;
 /// A family of related experiments. A new family implements this trait and has a line in [`super::FAMILIES`].
 pub(super) trait Family {
     /// What is stored of a run besides its evaluations: everything that figures and claims need.
-    type Tests: Serialize + DeserializeOwned;
+    type Measurements: Serialize + DeserializeOwned;
 
     /// The experiments of this family.
     const EXPERIMENTS: &'static [Experiment];
 
     /// Measures a run that has just reached the end of `stage`.
-    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
+    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Measurements>;
 
     /// Checks the thesis's claims and draws its figures, from stored results alone.
-    fn sections(results: &Results<Self::Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
+    fn sections(results: &Results<Self::Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
 }
 
 /// The policies of a run.

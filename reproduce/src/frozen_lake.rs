@@ -95,26 +95,26 @@ const fn with_30_seeds(experiment: Experiment) -> Experiment {
 
 /// The table that was learned, and the policies during training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Tests {
+pub(super) struct Measurements {
     /// The action-values at the end, state by state.
     q: Vec<f32>,
     /// Every evaluated policy, in order.
     #[serde(rename = "judged")]
-    evaluated: Vec<EvaluatedPolicy>,
+    evaluated: Vec<PolicySnapshot>,
 }
 
 /// A policy that was evaluated during training.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-struct EvaluatedPolicy {
+struct PolicySnapshot {
     /// Number of training episodes before it.
     episodes: u64,
     /// Its exact performance, by the lake's transition table.
     exact: ExpectedResult,
 }
 
-impl Tests {
+impl Measurements {
     /// (episodes, value) at each multiple of [`GRID`] episodes, for the last policy evaluated up to then.
-    fn on_grid(&self, of: impl Fn(&EvaluatedPolicy) -> f64) -> Vec<(f64, f64)> {
+    fn on_grid(&self, of: impl Fn(&PolicySnapshot) -> f64) -> Vec<(f64, f64)> {
         (1..=EPISODES / GRID)
             .filter_map(|i| {
                 let episodes = i * GRID;
@@ -140,10 +140,10 @@ impl Tests {
 pub(super) struct FrozenLake;
 
 impl Family for FrozenLake {
-    type Tests = Tests;
+    type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
         let Policies { config, run, last, .. } = policies;
         let layout = policy_layout(config)?;
         let mut steps = 0;
@@ -161,18 +161,18 @@ impl Family for FrozenLake {
         let evaluated = evaluations.iter().map(|evaluation| {
             let path = run.evaluated_policy(evaluation.env_steps);
             let policy = PolicyFile::read(&path, &layout).context("cannot read a policy that was evaluated")?;
-            Ok(EvaluatedPolicy {
+            Ok(PolicySnapshot {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
                 exact: ExpectedResult::of(&greedy(&policy.parameters)).rounded(),
             })
         });
-        Ok(Tests {
+        Ok(Measurements {
             evaluated: evaluated.collect::<anyhow::Result<_>>()?,
             q: last.parameters.clone(),
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let good = results.of(GOOD, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
@@ -233,7 +233,7 @@ The optimal policy reaches the goal with probability {optimal:.3}."
 }
 
 /// A setting's label, with its results.
-type SettingResults<'a> = (&'static str, &'a [SeedResult<Tests>]);
+type SettingResults<'a> = (&'static str, &'a [SeedResult<Measurements>]);
 
 fn of_sweep(
     writer: &FigureWriter,
@@ -243,7 +243,7 @@ fn of_sweep(
     number: &str,
     best: ExpectedResult,
 ) -> anyhow::Result<Vec<Figure>> {
-    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<CurvesOfSetting> {
+    let settings = |of: fn(&PolicySnapshot) -> f64| -> Vec<CurvesOfSetting> {
         let curves = sweep.iter().map(|(label, seeds)| {
             let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
             CurvesOfSetting {

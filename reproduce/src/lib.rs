@@ -1,6 +1,6 @@
 //! Runs the thesis's experiments over several seeds with Shoal itself, stores their results, and writes the report.
 //!
-//! A new experiment needs a file with a [`family::Family`], and a line in [`FAMILIES`].
+//! A new experiment needs a file with a `family::Family`, and a line in `FAMILIES`.
 
 mod cart_pole;
 mod claim;

@@ -39,7 +39,7 @@ run show the seed with the median final evaluation.";
 
 /// The swing-up from rest at the bottom, with the best and the last policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Tests {
+pub(super) struct Measurements {
     swing_up: SwingUp,
     best: Measures,
     last: Measures,
@@ -49,20 +49,20 @@ pub(super) struct Tests {
 pub(super) struct Pendulum;
 
 impl Family for Pendulum {
-    type Tests = Tests;
+    type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
         let run = |parameters| SwingUp::run(&mut Rollout::new(&policies.config, parameters)?);
         let best = run(&policies.best.parameters)?;
-        Ok(Tests {
+        Ok(Measurements {
             best: best.measures(),
             last: run(&policies.last.parameters)?.measures(),
             swing_up: best.rounded(),
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let seeds = results.of("pendulum", "");
         let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
         let mut figures = vec![writer.add(
@@ -90,11 +90,11 @@ impl Family for Pendulum {
     }
 }
 
-fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
+fn claims(seeds: &[SeedResult<Measurements>]) -> Vec<Claim> {
     let around_150 = |value: f64| (-190.0..=-110.0).contains(&value);
     let measured = |of: fn(&Measures) -> f64, decimals, unit| {
         let [best, last] = [0, 1].map(|i| {
-            let measures = |seed: &SeedResult<Tests>| of([&seed.tests.best, &seed.tests.last][i]);
+            let measures = |seed: &SeedResult<Measurements>| of([&seed.tests.best, &seed.tests.last][i]);
             spread(seeds.iter().map(measures), decimals)
         });
         format!("{best}{unit} (last policy {last}{unit})")
@@ -158,9 +158,9 @@ mod tests {
     use super::*;
     use shoal_run::testing::swing;
 
-    fn seed(number: u64, return_mean: f64, swing_up: SwingUp) -> SeedResult<Tests> {
+    fn seed(number: u64, return_mean: f64, swing_up: SwingUp) -> SeedResult<Measurements> {
         let measures = swing_up.measures();
-        let tests = Tests {
+        let tests = Measurements {
             best: measures.clone(),
             last: measures,
             swing_up: swing_up.rounded(),

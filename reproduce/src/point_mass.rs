@@ -62,9 +62,9 @@ const REMARK_ON_ADDITIONAL_TRAINING: &str = "\
 These are the same runs, resumed. The agent of appendix A.1 is the one at the end of the additional training. Here it is
 the last policy, not the best one by evaluation.";
 
-/// Test runs from the start positions of section 5.3, followed by those of appendix A.2.
+/// Test runs from the start positions of section 5.3, followed by the test runs of appendix A.2.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Tests {
+pub(super) struct Measurements {
     best: Vec<Measures>,
     last: Vec<Measures>,
     /// Test runs of the best policy.
@@ -79,16 +79,16 @@ pub(super) struct Tests {
 pub(super) struct PointMass;
 
 impl Family for PointMass {
-    type Tests = Tests;
+    type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let run = |parameters| TestRun::from_starts(&mut Rollout::new(&policies.config, parameters)?, &starts);
         let best = run(&policies.best.parameters)?;
         let last = run(&policies.last.parameters)?;
         let shown = if stage.suffix == LONGER { NEAR_STARTS.len() } else { 0 };
-        Ok(Tests {
+        Ok(Measurements {
             best: best.iter().map(TestRun::measures).collect(),
             last: last.iter().map(TestRun::measures).collect(),
             test_runs: best.into_iter().map(TestRun::rounded).collect(),
@@ -96,7 +96,7 @@ impl Family for PointMass {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [r1, r2, r3] = ["point-mass-r1", "point-mass-r2", "point-mass-r3"].map(|name| results.of(name, ""));
         let longer = results.of("point-mass-r2", LONGER);
         let section = |title, from: &[(&'static str, &'static str)], remark: &str, claims, figures| ReportSection {
@@ -154,14 +154,14 @@ mod tests {
     use shoal_run::testing::test_run;
 
     /// A seed whose test runs are made by [`test_run`] with these arguments.
-    pub(super) fn seed(number: u64, rest: f64, shake: f64, force: f64, held: f64) -> SeedResult<Tests> {
+    pub(super) fn seed(number: u64, rest: f64, shake: f64, force: f64, held: f64) -> SeedResult<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let test_runs: Vec<_> = starts
             .iter()
             .map(|start| test_run(*start, rest, shake, force, held))
             .collect();
         let measures: Vec<_> = test_runs.iter().map(TestRun::measures).collect();
-        let tests = Tests {
+        let tests = Measurements {
             best: measures.clone(),
             last: measures,
             last_test_runs: test_runs[..4].iter().cloned().map(TestRun::rounded).collect(),
@@ -175,7 +175,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let writer = FigureWriter::in_directory(directory.path().into(), false).unwrap();
         let mut results = Results::new();
-        let figures = |results: &Results<Tests>| -> Vec<usize> {
+        let figures = |results: &Results<Measurements>| -> Vec<usize> {
             let sections = PointMass::sections(results, &writer).unwrap();
             sections.iter().map(|section| section.figures.len()).collect()
         };

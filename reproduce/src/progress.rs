@@ -14,14 +14,14 @@ use shoal_run::records::recorder::recorded;
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
 use super::request::{Job, JobName};
-use super::training::RunState;
+use super::training::SeedProgress;
 
 /// The live line and its data.
 pub(super) struct ProgressDisplay<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
-    /// Number of all jobs, including those that had finished before the batch began.
+    /// Number of all jobs, including jobs that had finished before the batch began.
     total: usize,
     /// Every job that had not finished when the batch began.
     due: BTreeMap<JobName, Due>,
@@ -61,7 +61,7 @@ impl<'a> ProgressDisplay<'a> {
             .into_iter()
             .filter_map(|job| {
                 // If the run cannot be read, the error is reported when the job starts.
-                let state = RunState::of(&folder.run(job.experiment, job.seed)).unwrap_or(RunState::Absent);
+                let state = SeedProgress::of(&folder.run(job.experiment, job.seed)).unwrap_or(SeedProgress::Absent);
                 let length = job.experiment.length(effort)?;
                 let begin = length.progress(state.progress()).0;
                 Some((job.name(), Due { length, begin }))

@@ -12,7 +12,7 @@ use super::folder::Folder;
 use super::progress::ProgressDisplay;
 use super::request::{Job, JobName, ReproductionEnd};
 use super::settings::RunSettings;
-use super::training::{RunState, TrainingEnd, train};
+use super::training::{SeedProgress, TrainingEnd, train};
 
 /// The seeds that have no result yet, and where their results go.
 pub(super) struct SeedQueue<'a> {
@@ -82,7 +82,7 @@ impl SeedQueue<'_> {
     }
 
     fn work(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) {
-        // A closed channel is no reason to stop: the results are still stored.
+        // A closed channel does not end the work: the results are still stored.
         let _ = events.send(Event::Started(job));
         match self.run_stages(job, signals, events) {
             Ok(TrainingEnd::Finished) => _ = events.send(Event::Finished(job)),
@@ -103,7 +103,7 @@ impl SeedQueue<'_> {
                 continue;
             }
             let length = stage.length(self.effort);
-            let (done, total) = length.progress(RunState::of(&run)?.progress());
+            let (done, total) = length.progress(SeedProgress::of(&run)?.progress());
             if matches!(length, Length::Steps(_)) && done > total {
                 bail!(
                     "{} has trained beyond {length} without a stored result: remove the run directory to start the \

@@ -83,8 +83,8 @@ impl Stages<'_> {
         experiments.any(|experiment| experiment.stages.iter().any(|stage| self.line(experiment, stage).1))
     }
 
-    /// The seeds that a section uses and those that are missing, a line for each stage. `None` if none were requested
-    /// and none exist.
+    /// The seeds that a section uses and the seeds that are missing, a line for each stage. `None` if none were
+    /// requested and none exist.
     fn seeds_of(&self, section: &ReportSection) -> Option<Vec<String>> {
         let (mut lines, mut in_report) = (Vec::new(), false);
         for (name, suffix) in &section.from {

@@ -11,7 +11,7 @@ use super::results_file::ResultLine;
 use super::settings::RunSettings;
 
 /// The version of a result's format. Increase it whenever the meaning of a key changes.
-const SCHEMA: u32 = 1;
+const FORMAT: u32 = 1;
 
 /// The run that a result belongs to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -81,7 +81,7 @@ impl<T> SeedResult<T> {
 impl Header {
     pub(super) fn new(experiment: &Experiment, seed: u64, length: Length, settings: &RunSettings) -> Self {
         Self {
-            schema: SCHEMA,
+            schema: FORMAT,
             experiment: experiment.name.into(),
             seed,
             length,
@@ -98,9 +98,9 @@ impl Header {
             schema: u32,
         }
         let Versioned { schema } = parse(line)?;
-        if schema != SCHEMA {
+        if schema != FORMAT {
             bail!(
-                "{} has schema {schema}, this program writes {SCHEMA}: move it away, or choose another directory with \
+                "{} has schema {schema}, this program writes {FORMAT}: move it away, or choose another directory with \
                  --out",
                 line.place
             );

@@ -444,7 +444,7 @@ mod tests {
         let old_text = std::fs::read_to_string(&old).unwrap();
         assert_eq!(line.text.replacen("\"stage\":\"\",", "", 1), old_text.trim_end());
         Header::read(line).unwrap();
-        let read: SeedResult<<Pendulum as Family>::Tests> = result::read(line).unwrap();
+        let read: SeedResult<<Pendulum as Family>::Measurements> = result::read(line).unwrap();
         assert_eq!(read.evaluations.last().unwrap().steps, 4_000);
     }
 

@@ -15,12 +15,12 @@ use super::experiment::{Effort, Experiment, Length, Progress};
 
 /// The state of a run directory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum RunState {
+pub(super) enum SeedProgress {
     Absent,
     Started(Progress),
 }
 
-impl RunState {
+impl SeedProgress {
     pub(super) fn of(run: &Path) -> anyhow::Result<Self> {
         if remove_interrupted_start(run)? {
             return Ok(Self::Absent);
@@ -58,9 +58,9 @@ pub(super) fn train(
 ) -> anyhow::Result<TrainingEnd> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
-    match RunState::of(run)? {
-        RunState::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
-        RunState::Absent => {
+    match SeedProgress::of(run)? {
+        SeedProgress::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
+        SeedProgress::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
                 .arg(run);
@@ -71,7 +71,7 @@ pub(super) fn train(
                 command.args(["--set", setting]);
             }
         }
-        RunState::Started(_) => {
+        SeedProgress::Started(_) => {
             command.arg("resume").arg(run);
         }
     }
@@ -101,9 +101,12 @@ mod tests {
         let parent = tempfile::tempdir().unwrap();
         let run = parent.path().join("seed-1");
         std::fs::create_dir(&run).unwrap();
-        assert_eq!(RunState::of(&run).unwrap(), RunState::Absent);
+        assert_eq!(SeedProgress::of(&run).unwrap(), SeedProgress::Absent);
         std::fs::create_dir(&run).unwrap();
         std::fs::write(run.join("notes"), "").unwrap();
-        assert!(RunState::of(&run).is_err(), "a directory with other files is an error");
+        assert!(
+            SeedProgress::of(&run).is_err(),
+            "a directory with other files is an error"
+        );
     }
 }

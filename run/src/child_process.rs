@@ -41,7 +41,7 @@ pub fn wait_for_any(wakers: &[BorrowedFd<'_>], timeout: Duration) -> bool {
         .iter()
         .map(|waker| PollFd::from_borrowed_fd(*waker, PollFlags::IN))
         .collect();
-    // Only an absurdly long wait cannot be represented; it becomes one without a limit.
+    // Only an absurdly long wait cannot be represented; it then has no limit.
     let timeout = Timespec::try_from(timeout).ok();
     match poll(&mut ready, timeout.as_ref()) {
         Ok(ready) => ready > 0,

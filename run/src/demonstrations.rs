@@ -72,7 +72,12 @@ impl Demonstrations {
             let why = last.or_else(|| lines.clone().next()).unwrap_or("no message");
             bail!("--demonstrations {dataset}: {why}");
         }
-        Self::parse(stdout).with_context(|| format!("--demonstrations {dataset}: python3 has another package shoal"))
+        Self::parse(stdout).with_context(|| {
+            format!(
+                "--demonstrations {dataset}: python3 has an incompatible version of the package shoal; reinstall it: pip \
+                 install ./python"
+            )
+        })
     }
 
     /// The contents of such a file.
@@ -95,7 +100,7 @@ impl Demonstrations {
         })
     }
 
-    /// Checks that it fits a run with this configuration, and returns its rows' number.
+    /// Checks that it fits a run with this configuration, and returns the number of its rows.
     pub(crate) fn check(&self, config: &Config) -> Result<u64, UsageError> {
         let Header { dataset, rows, .. } = &self.header;
         let refused = |what: String| Err(UsageError(format!("--demonstrations {dataset}: {what}")));
@@ -193,7 +198,7 @@ impl Demonstrations {
         })
     }
 
-    /// What is worth a warning before a run of this configuration begins with the rows.
+    /// The warning before a run of this configuration begins with the rows, if one is needed.
     pub(crate) fn warning(&self, config: &Config) -> Option<String> {
         let there = self.header.environment.as_deref()?;
         let here = config.environment.name.strip_prefix("gym:")?;

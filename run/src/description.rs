@@ -6,13 +6,13 @@ use shoal_common::versioned_file::VersionedFile;
 use shoal_env_server::description::Description;
 use shoal_env_server::environment::make;
 
-/// Describes the environment of this configuration. Of one that another program serves, only the positions of its
-/// numbers are known.
+/// Describes the environment of this configuration. If another program serves it, only the positions of its numbers are
+/// known.
 ///
 /// # Errors
 /// When the environment cannot be created from the configuration.
 pub fn of(config: &Config) -> anyhow::Result<Description> {
-    if !config.environment.server.is_empty() {
+    if config.environment.is_external() {
         return Ok(Description::by_number(&config.spec));
     }
     let environment = make(&config.environment.name, &config.environment.parameters)?;
@@ -36,7 +36,7 @@ pub fn of_run(run: &RunDir, config: &Config) -> anyhow::Result<Description> {
 /// # Errors
 /// As for [`of_run`].
 pub fn kept(run: &RunDir, config: &Config) -> anyhow::Result<Option<Description>> {
-    if config.environment.server.is_empty() {
+    if !config.environment.is_external() {
         return Ok(None);
     }
     let file = run.description();

@@ -129,7 +129,7 @@ mod tests {
     #[test]
     fn a_vehicle_without_force_ends_where_it_started() {
         let (config, mut parameters) = small("name = \"point-mass\"\nreward = \"r1\"");
-        // The last bias is that of the force: tanh(−20) gives the least force, 0.
+        // The last bias belongs to the force: tanh(−20) gives the least force, 0.
         *parameters.last_mut().unwrap() = -20.0;
         let summary = evaluate(&config, &parameters, 50, 3).unwrap();
         // The mean distance of a square's points from its centre is 0.765 times half its side.

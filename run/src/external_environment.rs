@@ -30,7 +30,7 @@ use shoal_env_server::description::{self, Description};
 use shoal_env_server::frame::{self, Written};
 
 use crate::child_process::{ChildProcess, tied, wait_for_any};
-use crate::external_environment::server_location::ServerSurroundings;
+use crate::external_environment::server_location::LaunchContext;
 use crate::signals::{Interrupt, describe as describe_signal};
 
 /// The prefix of the names of Gymnasium environments.
@@ -75,7 +75,7 @@ pub struct LaunchSpec<'a> {
     /// With seed and index, selects the random streams of its training episodes.
     pub stream: u64,
     /// Where it is started, and with what.
-    pub surroundings: ServerSurroundings,
+    pub surroundings: LaunchContext,
     /// The file into which it is asked to write pictures, and their greatest height in pixels.
     pub pictures: Option<(PathBuf, u32)>,
     /// The file into which it is asked to write what its numbers mean.
@@ -88,7 +88,7 @@ impl LaunchSpec<'_> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
         };
-        let ServerSurroundings {
+        let LaunchContext {
             location, hash_seed, ..
         } = &self.surroundings;
         let mut command = match location {
@@ -229,7 +229,7 @@ impl ExternalEnvironment {
             environment,
             environments,
             seed,
-            ServerSurroundings::default(),
+            LaunchContext::default(),
             Interrupt::default(),
         )
     }
@@ -243,7 +243,7 @@ impl ExternalEnvironment {
         environment: &EnvironmentConfig,
         environments: u32,
         seed: u64,
-        surroundings: ServerSurroundings,
+        surroundings: LaunchContext,
         interrupt: Interrupt,
     ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
@@ -364,8 +364,8 @@ impl ExternalEnvironment {
         frame::read(file).context("the environment server's picture cannot be read")
     }
 
-    /// Whether the wait for an answer has ended without one: in time none came, or a signal did. A new server would take
-    /// as long.
+    /// Whether the wait for an answer has ended without an answer, because of the time limit or a signal. A new server
+    /// would take as long.
     pub fn is_silent(&self) -> bool {
         self.silent.get()
     }
@@ -378,7 +378,7 @@ impl ExternalEnvironment {
         }
     }
 
-    fn unanswered<T>(&self, asked: Instant) -> anyhow::Result<T> {
+    fn unanswered<T>(&mut self, asked: Instant) -> anyhow::Result<T> {
         if let Some(signal) = self.interrupt.signal() {
             bail!("ended by {}", describe_signal(signal));
         }
@@ -389,7 +389,7 @@ impl ExternalEnvironment {
                 self.limit.as_secs().saturating_mul(5)
             );
         }
-        bail!("the environment server has ended")
+        ended(&mut self.program)
     }
 }
 
@@ -447,8 +447,17 @@ fn open(
         },
     };
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop.clone());
-    let client = checked(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;
+    let Some(client) = checked(opened.map_err(Exit::from), &mut program)? else {
+        return ended(&mut program);
+    };
     Ok((services, client, listener, spec, program, stop))
+}
+
+/// The error that the program is about to end. The last lines it writes name the reason.
+fn ended<T>(program: &mut ChildProcess) -> anyhow::Result<T> {
+    program.wait(LAST_WORDS);
+    program.check()?;
+    bail!("the environment server does not answer, and does not end")
 }
 
 /// Adds what to do if the server for Gymnasium is not installed.

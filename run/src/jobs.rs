@@ -80,7 +80,7 @@ pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>
         }
         if let Some(signal) = interrupted().filter(|_| !terminated) {
             terminated = true;
-            // The same signal: the training ignores those that this process was started to ignore.
+            // The same signal: the training ignores the signals that this process was started to ignore.
             let signal = Signal::from_named_raw(signal).unwrap_or(Signal::TERM);
             // This fails only if the training has ended.
             let _ = training.signal(signal);

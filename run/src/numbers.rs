@@ -16,7 +16,7 @@ const EXACT: f64 = 9_007_199_254_740_992.0;
 /// A count as people write it: `120000`, `120_000`, `1e5`, `1.5e6`, `30k` or `1M`.
 ///
 /// # Errors
-/// When the text is no whole number from 0 to 2^64 − 1.
+/// When the text is not a whole number from 0 to 2^64 − 1.
 pub fn parse_count(text: &str) -> Result<u64, String> {
     let refused = || format!("{text} is not a whole number, such as 1000, 1e5, 30k or 1M");
     let plain = text.replace('_', "");
@@ -43,7 +43,7 @@ pub fn parse_count(text: &str) -> Result<u64, String> {
 /// A count that fits into 32 bits.
 ///
 /// # Errors
-/// When the text is no whole number from 0 to 2^32 − 1.
+/// When the text is not a whole number from 0 to 2^32 − 1.
 pub fn parse_small_count(text: &str) -> Result<u32, String> {
     u32::try_from(parse_count(text)?).map_err(|_| format!("{text} is too large: at most {}", u32::MAX))
 }
@@ -51,7 +51,7 @@ pub fn parse_small_count(text: &str) -> Result<u32, String> {
 /// A count of 32 bits that is not 0.
 ///
 /// # Errors
-/// When the text is no whole number from 1 to 2^32 − 1.
+/// When the text is not a whole number from 1 to 2^32 − 1.
 pub fn parse_positive_count(text: &str) -> Result<u32, String> {
     match parse_small_count(text)? {
         0 => Err("0 is too small: at least 1".into()),

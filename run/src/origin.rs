@@ -31,7 +31,7 @@ pub enum Origin {
     Dataset(DatasetOrigin),
 }
 
-/// A dataset with whose rows a replay began.
+/// The dataset that supplied the initial rows.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DatasetOrigin {
     /// Its name.
@@ -42,7 +42,7 @@ pub struct DatasetOrigin {
     pub rows: u64,
 }
 
-/// A run with whose networks another one began.
+/// The run that supplied the initial networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOrigin {
     /// The directory of the other run.
@@ -53,7 +53,7 @@ pub struct RunOrigin {
     pub updates: u64,
     /// SHA-256 of their weights, as `weights_sha256` of `train --json`.
     pub weights_sha256: String,
-    /// Rows of its replay that this run began with.
+    /// The number of initial rows, copied from its replay.
     pub rows: u64,
 }
 
@@ -70,7 +70,7 @@ impl Origin {
         Ok(Self::load_if_any(&run.origin())?)
     }
 
-    /// Rows that the run's replay began with.
+    /// The number of initial rows.
     pub fn rows(&self) -> u64 {
         match self {
             Self::Run(origin) => origin.rows,

@@ -1,4 +1,4 @@
-//! The Python package `shoal`, whose modules do what needs other packages of Python.
+//! The Python package `shoal`, whose modules use other packages of Python.
 
 use std::process::{Command, Stdio};
 

@@ -70,7 +70,7 @@ impl Signals {
             }
             Ok(Self { last, wake })
         };
-        // Before the first handler: one that an earlier receiver has left must not end the process either.
+        // Before the first handler is registered: a handler that an earlier receiver has left must not end the process.
         change_receivers(|receivers| receivers + 1);
         let signals = registered().inspect_err(|_| change_receivers(|receivers| receivers - 1));
         signals.context("cannot watch for signals")
@@ -88,7 +88,7 @@ impl Signals {
         Interrupt(Arc::clone(&self.last))
     }
 
-    /// Waits at most `patience` for a signal; the last one that has arrived, if any.
+    /// Waits at most `patience` for a signal. Returns the last signal that has arrived, if any.
     pub fn wait(&self, patience: Duration) -> Option<i32> {
         if self.last.load(Ordering::Relaxed) == 0 {
             wait_for_any(&[self.as_fd()], patience);
@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn a_signal_wakes_a_waiting_thread_and_is_remembered() {
-        // An earlier receiver and another one at the same time, which are gone by then, do not count.
+        // Receivers that have been dropped do not count.
         drop(Signals::register().unwrap());
         let signals = Signals::register().unwrap();
         drop(Signals::register().unwrap());

@@ -41,9 +41,9 @@ pub struct Suite {
     pub halving: Option<Halving>,
 }
 
-/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, and the
-/// one that is left is trained to the end. With n rounds, the first ends when each run has done 1/2ⁿ of its steps, and
-/// each further one when it has done twice as many.
+/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended. The last
+/// one is trained to the end. With n rounds, the first ends when each run has done 1/2ⁿ of its steps, and each further
+/// one when it has done twice as many.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Halving {
     /// The names of the runs that each completed round has ended.
@@ -64,7 +64,7 @@ pub struct Round {
 pub struct Trial {
     /// The name of its directory.
     pub name: String,
-    /// Its seed; `None` for that of the preset or file.
+    /// Its seed; `None` for the preset's or the file's.
     pub seed: Option<u64>,
     /// What it has of its own, each as `SECTION.KEY=VALUE`.
     pub set: Vec<String>,
@@ -159,8 +159,8 @@ impl VersionedFile for Suite {
 }
 
 impl Suite {
-    /// The suite of all combinations of these values, each with every seed. Without seeds, each has that of the preset
-    /// or file.
+    /// The suite of all combinations of these values, each with every seed. Without seeds, each has the seed of the
+    /// preset or file.
     ///
     /// # Errors
     /// When a key is swept twice, or there are too many runs.
@@ -308,8 +308,8 @@ impl Suite {
         })
     }
 
-    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs, without
-    /// the runs whose result is not finite. Returns the names of the ended runs.
+    /// Ends the worse half of the settings that are left: the settings with the lower mean of `result` over their runs.
+    /// Runs whose result is not finite do not count. Returns the names of the ended runs.
     pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
         let mut left = self.settings();
         left.retain(|setting| !self.was_ended_early(&self.trials[setting[0]]));

@@ -1,5 +1,5 @@
-//! Records on a disk that is full for a while. The limit on the size of files is that of a whole process, so this test
-//! is alone in its own.
+//! Records on a disk that is full for a while. The limit on the size of files holds for a whole process, so this test
+//! has a process of its own.
 
 use std::time::Duration;
 

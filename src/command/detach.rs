@@ -44,7 +44,7 @@ struct Printed<'a> {
 /// # Errors
 /// When the run is running already, or does not start in time.
 pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
-    // A run that is running already is refused here. Later it would look like the one that is started here.
+    // A run that is running already is refused here. Later its launcher would look like the new one.
     drop(RunDir::open(path)?.lock()?);
     let of_environment = RunClient::open(path)?.config.environment.start_seconds;
     let patience = PATIENCE + Duration::from_secs(of_environment.into());

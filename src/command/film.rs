@@ -22,7 +22,7 @@ pub(crate) struct FilmArgs {
     /// Which policy to play.
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: SavedPolicy,
-    /// Number of episodes. Their start states are those of `eval`.
+    /// Number of episodes. They start in the same states as in `eval`.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=50))]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].

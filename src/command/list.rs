@@ -35,7 +35,7 @@ struct Printed<'a> {
 #[derive(Serialize)]
 struct ListedSuite {
     path: PathBuf,
-    /// The number of its runs, and of those that have begun.
+    /// The number of its runs, and how many of them have begun.
     runs: usize,
     begun: usize,
 }
@@ -83,7 +83,7 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The suites in a directory, by name. One that cannot be read is left out.
+/// The suites in a directory, by name. A suite that cannot be read is left out.
 fn suites_in(directory: &Path) -> std::io::Result<Vec<ListedSuite>> {
     let mut suites = Vec::new();
     for entry in std::fs::read_dir(directory)? {

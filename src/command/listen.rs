@@ -51,7 +51,7 @@ fn make_keys(_config: &Config, _run: &RunDir, _new: bool) -> anyhow::Result<Path
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct ListenArgs {
     /// Let other hosts join the run with `shoal join`, at this address of this machine (tls/10.0.0.1:7447) [default:
-    /// all addresses and a free port, or those of before].
+    /// all addresses and a free port, or as before].
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = Endpoint::DEFAULT)]
     pub(crate) listen: Option<String>,
 

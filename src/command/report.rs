@@ -17,7 +17,7 @@ use super::output_file::check_replaceable;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ReportArgs {
-    /// Run directories, or those of suites. Runs in the same environment are compared.
+    /// Directories of runs or suites. Runs in the same environment are compared.
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
     /// The file to write [default: report.html in that directory; for several, in the working directory].
@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         [one] if Suite::read(one)?.is_some() => StartRecord::read(one)?,
         _ => None,
     };
-    // Pictures of some environments take a while. Nothing is shown where standard error is no terminal.
+    // Pictures of some environments take a while. Nothing is shown where standard error is not a terminal.
     let bar = ProgressBar::new_spinner().with_message("reading the runs and playing episodes");
     bar.enable_steady_tick(Duration::from_millis(200));
     let report = page::gather(&runs, suite);
@@ -64,7 +64,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Opens the runs, and those of suites. Each may be named only once.
+/// Opens the runs, and all runs of the suites. Each may be named only once.
 fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
     let mut runs: Vec<RunDir> = Vec::new();
     for path in paths {

@@ -50,7 +50,7 @@ pub(crate) struct ResumeArgs {
 }
 
 impl ResumeArgs {
-    /// The options but those of output, for another process.
+    /// All options except the output options, for another process.
     fn for_another_process(&self) -> Vec<OsString> {
         let Self {
             run: _,
@@ -97,7 +97,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         );
     }
     if used.run.has_origin() && Origin::read(&run)?.is_none() {
-        bail!("the start of {here} was interrupted before it had what it begins with: remove it and train again");
+        bail!("{here} was interrupted while it copied its initial networks or rows; remove it and train again");
     }
     let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
     let asked = RequestedChanges {
@@ -176,7 +176,7 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     let here = run.path().display();
     let config = &revision.config;
     let episodes = u64::from(config.evaluation.episodes);
-    // One that cannot be read is the evaluator's error.
+    // If the best policy cannot be read, the evaluator reports that.
     let has_other_episodes = SavedPolicy::Best
         .read(run, config)
         .is_ok_and(|best| ![0, episodes].contains(&best.episodes));

@@ -19,7 +19,7 @@ use crate::launcher;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct RmArgs {
-    /// Run directories, or those of suites.
+    /// Directories of runs or suites.
     #[arg(value_name = "RUN|SUITE", required = true)]
     pub(crate) runs: Vec<PathBuf>,
     /// Remove only the replays. The runs can still be evaluated and exported, but not resumed.
@@ -30,7 +30,7 @@ pub(crate) struct RmArgs {
     pub(crate) yes: bool,
 }
 
-/// A run to be removed. The lock keeps it from being started meanwhile.
+/// A run to be removed. The lock keeps others from starting it.
 struct Removal {
     run: LockedRun,
     bytes: u64,

@@ -22,7 +22,7 @@ pub(crate) struct TrainArgs {
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
     #[arg(add = ArgValueCompleter::new(completion::presets_and_files))]
     pub(crate) what: Option<String>,
-    /// Explain every key of the configuration, or those of the named preset or file, without training.
+    /// Explain every key of the configuration, or the keys that the named preset or file sets, without training.
     #[arg(long)]
     pub(crate) help_config: bool,
     #[command(flatten)]
@@ -111,8 +111,8 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         return begun;
     }
     run_training(config, &run, &args.output, &args.listen).inspect_err(|_| {
-        // If no process was started, the directory is removed, so that its name is free again. By now the path may
-        // belong to somebody else.
+        // If no process was started, the directory is removed, so that its name is free again. The check ensures that
+        // the path still leads to it.
         if run.check().is_ok() && !run.incarnations().exists() {
             let _ = run.remove();
         }

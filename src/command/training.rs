@@ -16,7 +16,7 @@ use shoal_env_server::environment::Goal;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
 use shoal_run::description;
-use shoal_run::evaluation::best_policy::{self, EvaluatedPolicy};
+use shoal_run::evaluation::best_policy::{self, FinalResult};
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
@@ -163,7 +163,7 @@ fn final_evaluation(
     env_steps: u64,
     interrupt: &Interrupt,
     quiet: bool,
-) -> anyhow::Result<Vec<EvaluatedPolicy>> {
+) -> anyhow::Result<Vec<FinalResult>> {
     let target = if quiet {
         ProgressDrawTarget::hidden()
     } else {
@@ -224,16 +224,12 @@ impl Summary {
 }
 
 /// The name of each evaluated policy and its result in words.
-fn results(
-    config: &Config,
-    run: &RunDir,
-    evaluated: &[EvaluatedPolicy],
-) -> anyhow::Result<Vec<(&'static str, String)>> {
+fn results(config: &Config, run: &RunDir, evaluated: &[FinalResult]) -> anyhow::Result<Vec<(&'static str, String)>> {
     if evaluated.is_empty() {
         return Ok(Vec::new());
     }
     let goal = description::of_run(run, config)?.goal;
-    let result = |it: &EvaluatedPolicy| (name(it.policy), in_words(&it.summary, goal.as_ref()));
+    let result = |it: &FinalResult| (name(it.policy), in_words(&it.summary, goal.as_ref()));
     Ok(evaluated.iter().map(result).collect())
 }
 

@@ -176,10 +176,13 @@ impl Supervisor {
             run: run.path().into(),
             server_output: match log_level() {
                 LevelFilter::DEBUG | LevelFilter::TRACE => Writer::Shoal,
-                _ if config.environment.server.is_empty() => Writer::Shoal,
+                _ if !config.environment.is_external() => Writer::Shoal,
                 _ => Writer::Program,
             },
-            server_start_limit: (!config.environment.server.is_empty()).then(|| config.environment.start_limit()),
+            server_start_limit: config
+                .environment
+                .is_external()
+                .then(|| config.environment.start_limit()),
             counter,
             processes_started: started,
             reserved: started,

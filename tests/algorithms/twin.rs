@@ -197,7 +197,7 @@ pub(crate) fn of_minibatches<A: MinibatchAlgorithm>(config: &Config, mut algorit
     let n = config.replay.n_step as usize;
     while (rows.len() as u64) < config.run.steps {
         let act: Act = if algorithm.updates() == 0 {
-            Exploration::warm_up
+            Exploration::warmup
         } else {
             Exploration::act
         };

@@ -27,7 +27,7 @@ pub(crate) enum Target {
     Program(u32),
 }
 
-/// The call before which to kill the target: its kind, and its number among those of this kind, from 1.
+/// The call before which to kill the target: its kind, and its number among the calls of this kind, from 1.
 pub(crate) type CrashPoint = (Call, u32);
 
 /// The result of a traced command.

@@ -77,7 +77,7 @@ pub(crate) enum Victim {
     CleanUp,
 }
 
-/// Index of the evaluator's environment server: it follows those of all possible actors (`actors.max`).
+/// Index of the evaluator's environment server: it follows the servers of all possible actors (`actors.max`).
 const EVALUATION: u32 = 4;
 
 impl Victim {

@@ -1,4 +1,4 @@
-//! Actors that are killed: the chunks they sent arrive, and arrive before those of their successors.
+//! Actors that are killed: the chunks they sent arrive, and arrive before their successors' chunks.
 
 use std::time::Duration;
 

@@ -1,6 +1,6 @@
 //! Delivery between real processes, any of which may be killed: chunks, policies, environment steps, and the leftovers
-//! of a run in shared memory. The promises are those of "Delivery of chunks" in `docs/DESIGN.md`. The child processes
-//! run this test binary.
+//! of a run in shared memory. "Delivery of chunks" in `docs/DESIGN.md` has the promises. The child processes run this
+//! test binary.
 
 #![allow(
     clippy::unwrap_used,

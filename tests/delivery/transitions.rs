@@ -11,7 +11,7 @@ use crate::run::{Run, eventually};
 
 const FULL: u64 = WINDOW as u64;
 
-/// Waits until the actor waits for a full window, of which the learner has committed nothing.
+/// Waits until the actor waits because its window is full. The learner has committed nothing of it.
 fn wait_for_full_window(actor: &Process, run: &Run) {
     let commits = run.commits();
     while actor.expect_line("full")[0] != commits.committed(0).sequence + FULL {}

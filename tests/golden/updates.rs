@@ -1,5 +1,5 @@
 //! Repeats gradient steps of PyTorch's autograd and Adam: from the `initial` networks, one step for each of `batches`.
-//! After each step the losses and networks must be those in `expected`.
+//! After each step the losses and networks must be as in `expected`.
 
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
@@ -19,7 +19,7 @@ use shoal_learner::algorithms::td3::Td3;
 
 use super::{FLAGS, Failure, VALUES, close, read};
 
-/// Compares the updates in `file` with those of its algorithm.
+/// Compares the updates in `file` with the updates of its algorithm.
 pub(super) fn check(file: &Value) -> Result<(), Failure> {
     let constants = serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8});
     if file["adam"] != constants {
@@ -164,7 +164,7 @@ fn recorded(networks: &[(&'static str, &'static str)]) -> Vec<Recorded> {
 }
 
 /// Starts `algorithm` from the initial networks and takes a step for each batch. `update` takes one and returns the
-/// losses, which are compared with those of the same name that the file has.
+/// losses, which are compared with the file's losses of the same name.
 fn repeat<A: MinibatchAlgorithm>(
     file: &Value,
     batches: &Batches,

@@ -118,7 +118,7 @@ equal(first_rows(began, 1_900), alone.transitions().copy())
 began.to_minari("pendulum/began-v0")
 own = check(began, "pendulum/began-v0", 0.99)
 assert own.total_steps == 500 and "1900 rows with which" in own.storage.metadata["description"]
-# Another γ is that of the rows.
+# The rows have the other γ.
 near = {**SMALL, "ddpg.gamma": 0.5}
 directory = "datasets/pendulum/alone-v0"
 other = shoal.train("pendulum", run="other", steps=100, set=near, demonstrations=directory, quiet=True)

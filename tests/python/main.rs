@@ -1,4 +1,4 @@
-//! `import shoal`: runs that Python starts, and numpy policies beside those of this program.
+//! `import shoal`: runs that Python starts, and numpy policies beside this program's policies.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

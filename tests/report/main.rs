@@ -444,7 +444,7 @@ fn check_player(browser: &mut Browser, run: &str) {
     browser.key("Home");
     browser.key(" ");
     until("space plays", || frame(browser) > 0);
-    // The other episodes may be over by now; this one takes ten seconds.
+    // The other episodes may be over; this one takes ten seconds.
     if run == "swing" {
         assert!(is_playing(browser));
         browser.key(" ");

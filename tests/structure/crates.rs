@@ -8,7 +8,7 @@ pub(crate) struct Package {
     pub(crate) name: String,
     /// Names of the packages, without dev-dependencies.
     pub(crate) dependencies: BTreeSet<String>,
-    /// Those of `src/lib.rs` and `src/main.rs` that exist.
+    /// `src/lib.rs` and `src/main.rs`, as far as they exist.
     pub(crate) roots: Vec<PathBuf>,
 }
 

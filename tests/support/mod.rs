@@ -173,7 +173,7 @@ impl Workplace {
     }
 }
 
-/// A running run renames its temporary files meanwhile; those that are gone are left out.
+/// A running run renames its temporary files: files that are gone are left out.
 fn copy_directory(from: &Path, to: &Path) {
     std::fs::create_dir(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {

@@ -7,7 +7,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::support::{Workplace, error_line, output_of, until};
 
-/// The files in a directory, apart from those of these names.
+/// The files in a directory, except the files of these names.
 fn others(directory: &Path, known: &[&str]) -> Vec<String> {
     let files = std::fs::read_dir(directory).unwrap();
     let names = files.map(|file| file.unwrap().file_name().into_string().unwrap());

@@ -118,7 +118,7 @@ impl Cable {
 impl Drop for Cable {
     fn drop(&mut self) {
         for end in End::ALL {
-            // One that was never made is not removed either.
+            // It fails for a namespace that was never made.
             let _ = ip(&["netns", "del", &self.namespace(end)]);
         }
     }

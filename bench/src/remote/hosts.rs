@@ -97,7 +97,7 @@ struct Launcher<'a> {
     run: &'a RunDir,
     control: ControlPort,
     leases: Vec<HostLease>,
-    /// That of the last actor: the learner receives from all actors up to the last that it has heard of.
+    /// The last actor's: the learner receives from all actors up to the last that it has heard of.
     heartbeat: HeartbeatSender,
 }
 
@@ -189,7 +189,7 @@ impl<'a> RemoteRun<'a> {
             limit: (u64::from(host) + 2) * HostLease::INCARNATIONS,
         };
         let mut services = Services::new(domain)?;
-        // Those of the run's own actors exist.
+        // The services of the run's own actors exist.
         if config.actors_that_share() > 0 {
             services.create_shared_transitions(domain, config.actors_that_share(), config.actors.window)?;
         } else {
@@ -376,7 +376,7 @@ impl<'a> RemoteRun<'a> {
             ended = ended.and(host.end());
         }
         self.gate.ask_to_end();
-        // It tells its hosts that it ends, and its launcher answers meanwhile.
+        // It tells its hosts that it ends. Its launcher must answer until then.
         let deadline = Instant::now() + STARTUP_TIMEOUT;
         while self.gate.wait(ANSWER_INTERVAL).is_none() && Instant::now() < deadline {
             ended = ended.and(self.launcher.answer());

@@ -9,7 +9,7 @@ pub(super) fn busy(pid: u32) -> anyhow::Result<Duration> {
     let tasks = format!("/proc/{pid}/task");
     let mut nanoseconds = 0;
     for task in std::fs::read_dir(&tasks).with_context(|| format!("cannot read {tasks}"))? {
-        // A thread that has ended meanwhile is not counted.
+        // A thread that has just ended is not counted.
         let text = std::fs::read_to_string(task?.path().join("schedstat")).unwrap_or_default();
         let first = text.split_ascii_whitespace().next();
         nanoseconds += first.and_then(|number| number.parse().ok()).unwrap_or(0_u64);

@@ -61,7 +61,7 @@ pub(super) struct Recovery {
 }
 
 impl Startup {
-    pub(super) fn warm_up(&self) -> Duration {
+    pub(super) fn warmup(&self) -> Duration {
         self.warm - self.first_row
     }
 }
@@ -194,7 +194,7 @@ impl Training {
             }
             let header = newest(&mut observer.policies)?.filter(|header| header.incarnation > before);
             let Some(header) = header else { return Ok(None) };
-            // The successor's first policy is that of the checkpoint.
+            // The successor's first policy is the checkpoint's.
             let restored = *first.get_or_insert(header.updates);
             let is_changed = header.updates > restored;
             Ok(ready.filter(|_| is_changed).map(|ready| {

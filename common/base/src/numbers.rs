@@ -1,4 +1,8 @@
-//! Sums and checks of slices of numbers.
+//! Sums and checks of slices of numbers, and the limit of counters.
+
+/// No counter of a run reaches this number: rows, updates, episodes, versions, records, processes. Sums of numbers
+/// below it do not overflow.
+pub const COUNTER_LIMIT: u64 = 1 << 60;
 
 /// Mean and sample standard deviation; the latter is 0 for fewer than two numbers.
 pub fn mean_and_std(numbers: &[f64]) -> (f64, f64) {

@@ -23,7 +23,7 @@ pub struct Heartbeat {
     pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,
-    /// Environment steps since it started; for a learner gradient steps, or rows where each is used once.
+    /// Environment steps since it started; for a learner updates: gradient steps, or consumed rows (`TransitionUse`).
     pub steps: u64,
     /// Version of the policy it uses or publishes.
     pub policy_version: u64,
@@ -89,15 +89,15 @@ pub struct EpisodeReport {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ZeroCopySend)]
 #[repr(C)]
 pub struct EvaluationReport {
-    /// The policy's version.
+    /// Version of the evaluated policy.
     pub policy_version: u64,
     /// Environment steps that the policy was learned from.
     pub env_steps: u64,
-    /// Gradient steps that made the policy; rows where each is used once.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`), that made the policy.
     pub updates: u64,
     /// Mean of the episodes' returns.
     pub return_mean: f64,
-    /// Their standard deviation (of the sample: n − 1).
+    /// Standard deviation of the episodes' returns (of the sample: n − 1).
     pub return_std: f64,
     /// Episodes run.
     pub episodes: u32,
@@ -121,16 +121,17 @@ pub struct LearnerReport {
     pub env_steps: u64,
     /// Episodes that end within them.
     pub episodes: u64,
-    /// Gradient steps made so far; rows where each is used once.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`), so far.
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,
     /// Mean squared error of the value estimates (the critic, line 13 of Algorithm 4; the baseline; or the table),
     /// averaged over the updates since the last report.
     pub critic_loss: f64,
-    /// The loss of the policy, averaged likewise: −mean Q(s, μ(s)), or for REINFORCE the negative of its objective.
+    /// The loss of the policy, averaged as `critic_loss`: −mean Q(s, μ(s)), or for REINFORCE the negative of its
+    /// objective.
     pub actor_loss: f64,
-    /// Mean Q(s, a), or for REINFORCE the mean return, averaged likewise.
+    /// Mean Q(s, a), or for REINFORCE the mean return, averaged as `critic_loss`.
     pub q_mean: f64,
     /// Number of updates in the averages; if it is 0, the three means are 0.
     pub averaged: u64,

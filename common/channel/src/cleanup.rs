@@ -1,8 +1,8 @@
 //! Removal of what killed processes leave in shared memory.
 //!
 //! iceoryx2 0.10 creates a file in steps: create, set the size, fill, make readable. If a process dies in between,
-//! others retry to open its half-made file for a second, or forever if they run as root and the file has no size yet.
-//! So half-made files of dead processes are removed here as soon as they are seen.
+//! others retry to open its unfinished file for a second, or forever if they run as root and the file has no size yet.
+//! So unfinished files of dead processes are removed here as soon as they are seen.
 //!
 //! iceoryx2 also never frees a port whose port tag is removed before the port. So missing tags are restored before
 //! iceoryx2 cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)). `tests/iceoryx2.rs` shows
@@ -27,20 +27,20 @@ use super::files::{SHARED_MEMORY, files_of};
 use super::memory::is_reservation;
 use super::presence::is_presence;
 
-/// Interval between two sweeps: the longest time that a half-made file of a dead process delays other processes.
+/// Interval between two sweeps: the longest time that an unfinished file of a dead process delays other processes.
 const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
 
 /// The least age of a file that is removed. Its maker may still be creating it, which takes some microseconds, even if
 /// no process seems to have it open.
 const MIN_AGE: Duration = Duration::from_millis(50);
 
-/// How long a clean-up waits for half-made files whose makers may be alive.
+/// How long a clean-up waits for unfinished files whose makers may be alive.
 const MAKER_PATIENCE: Duration = Duration::from_millis(200);
 
 /// How long iceoryx2 may wait for another process that cleans up after the same dead process.
 const OTHER_CLEANER: Duration = Duration::from_millis(100);
 
-/// A thread that removes half-made files of killed processes until this is dropped.
+/// A thread that removes unfinished files of killed processes until this is dropped.
 #[derive(Debug)]
 pub struct Sweeper {
     stop: Option<Sender<()>>,
@@ -48,7 +48,7 @@ pub struct Sweeper {
 }
 
 impl Sweeper {
-    /// Starts to remove half-made files of a run. It is used by the run's launcher, and by a process that asks a
+    /// Starts to remove unfinished files of a run. It is used by the run's launcher, and by a process that asks a
     /// launcher, because the launcher may be killed while it answers.
     ///
     /// # Errors
@@ -59,7 +59,7 @@ impl Sweeper {
         let sweep = move || {
             while stopped.recv_timeout(SWEEP_INTERVAL) == Err(RecvTimeoutError::Timeout) {
                 if let Err(error) = remove_unfinished(&run_id) {
-                    tracing::warn!("cannot remove half-made files of killed processes: {error}");
+                    tracing::warn!("cannot remove unfinished files of killed processes: {error}");
                 }
             }
         };
@@ -82,7 +82,7 @@ impl Drop for Sweeper {
     }
 }
 
-/// Removes half-made files of killed processes. Returns whether no half-made file is left.
+/// Removes unfinished files of killed processes. Returns whether none is left.
 pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
     let mut unfinished = files_of(run_id)?;
     unfinished.retain(|(path, metadata)| is_unfinished(path, metadata));
@@ -145,7 +145,7 @@ impl Domain {
             run_id: run_id.into(),
             cause,
         })?;
-        // iceoryx2 would never free a port with a half-made connection, so those are removed first.
+        // iceoryx2 would never free a port with an unfinished connection, so those are removed first.
         let deadline = Instant::now() + MAKER_PATIENCE;
         let listing = || io_error("clean up", Path::new(SHARED_MEMORY));
         while !remove_unfinished(run_id).map_err(listing())? && Instant::now() < deadline {

@@ -44,9 +44,9 @@ pub enum DomainError {
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
     Io {
-        /// What was tried.
+        /// What was tried, as a verb.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
         /// The system's reason.
         cause: io::Error,
@@ -64,15 +64,15 @@ pub enum DomainError {
         pids.iter().map(i32::to_string).collect::<Vec<_>>().join(" ")
     )]
     StillAlive {
-        /// The run.
+        /// The id of the run.
         run_id: String,
-        /// Their process ids.
+        /// The ids of the living processes.
         pids: Vec<i32>,
     },
     /// iceoryx2 refused.
     #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
     Join {
-        /// The run.
+        /// The id of the run.
         run_id: String,
         /// iceoryx2's reason.
         cause: String,
@@ -148,8 +148,8 @@ impl Domain {
         Self::directory_of(&self.run_id)
     }
 
-    /// The same for the run `run_id`, for a process that has not joined it. Its path is short and has only plain
-    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and those of more than
+    /// The directory of the run `run_id`, for a process that has not joined it. Its path is short and has only plain
+    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and paths of more than
     /// 255 bytes.
     ///
     /// # Errors
@@ -200,7 +200,7 @@ impl Domain {
         same && has_services && std::fs::metadata(details).map_or_else(|error| !is_missing(&error), |_| true)
     }
 
-    /// Whether a process of the run is alive, even one that iceoryx2 does not find. Visitors are not counted.
+    /// Whether a process of the run is alive, even if iceoryx2 does not find it. Visitors are not counted.
     pub fn has_members(&self) -> bool {
         matches!(presence::claim(&self.run_id), Ok(Claim::Held))
     }
@@ -254,7 +254,7 @@ impl Domain {
         }
     }
 
-    /// Removes the files of those of this user's runs that no longer have a living process.
+    /// Removes the files of this user's runs that no longer have a living process.
     ///
     /// # Errors
     /// When the user's directory cannot be read, or files cannot be removed.
@@ -295,7 +295,7 @@ fn close_to_others(run_id: &str) -> Result<(), DomainError> {
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
         if path.extension().is_some_and(|extension| extension == "global_mgmt") {
             std::fs::set_permissions(&path, Permissions::from_mode(0o600))
-                .map_err(io_error("restrict the rights of", &path))?;
+                .map_err(io_error("restrict the permissions of", &path))?;
         }
     }
     Ok(())

@@ -77,7 +77,7 @@ pub enum ChannelErrorKind {
     #[error("all its ports are used by other processes; end those first")]
     Occupied,
     /// Another process is creating the service, or was killed while it did.
-    #[error("it is half made, by a process that was killed or is stopped; try again")]
+    #[error("it is unfinished, because the process that creates it was killed or is stopped; try again")]
     Unfinished,
     /// A signal interrupted the call.
     #[error("a signal interrupted the call; try again")]

@@ -33,8 +33,8 @@ impl HeartbeatSender {
         })
     }
 
-    /// Reports that the first step of the work begins, which the process may not survive. So the launcher can tell a
-    /// role that dies during its first step from one that was waiting.
+    /// Reports that the first step of the work begins, which the process may not survive. So the launcher distinguishes
+    /// a role that dies in its first step from a role that was waiting.
     pub fn begin_work(&mut self) {
         if self.heartbeat.steps == 0 {
             self.beat_now(Activity::Working);

@@ -63,7 +63,7 @@ pub struct PolicyHeader {
     pub version: u64,
     /// Environment steps that it was learned from.
     pub env_steps: u64,
-    /// Gradient steps that made it; rows where each is used once.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`), that made it.
     pub updates: u64,
     /// Fingerprint of the parameters' layout.
     pub fingerprint: u64,
@@ -207,8 +207,8 @@ fn nodes(max_actors: usize) -> usize {
     max_actors + 4
 }
 
-/// Policies that can be in use at once: those that readers hold, the newest one, its replacement while that is being
-/// published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
+/// Policies that can be in use at once: the policies that readers hold, the newest one, its replacement while that is
+/// being published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
 fn samples(max_actors: usize) -> usize {
     let (waiting, being_written) = (2, 1);
     readers(max_actors) * BORROWED + waiting + being_written

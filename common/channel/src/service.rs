@@ -45,7 +45,7 @@ pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName
 pub(super) const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is
-/// transient: a dead process may occupy the port until the launcher has cleaned up after it, and its half-made files
+/// transient: a dead process may occupy the port until the launcher has cleaned up after it, and its unfinished files
 /// exist until they are removed. Any other failure is returned at once.
 pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
     let deadline = Instant::now() + CLAIM_PATIENCE;

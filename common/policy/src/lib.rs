@@ -115,7 +115,8 @@ pub enum Policy {
     Deterministic(DeterministicPolicy),
     /// A squashed normal distribution. The action of its mean is taken.
     Gaussian(GaussianPolicy),
-    /// A score for every action, π(a|s) or Q(s, a). The action with the highest score is taken.
+    /// A score for every action: the logits of π, or the action-values Q(s, a). The action with the highest score is
+    /// taken.
     Scored(Scores),
 }
 

@@ -41,15 +41,15 @@ pub enum PolicyFileError {
     /// The file exists, but cannot be used.
     #[error("{path}: {reason}; the file was left as it is")]
     Refused {
-        /// The file.
+        /// The policy file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
     /// The file cannot be written. An older file is intact.
-    #[error("{path}: cannot write the policy: {source}; free some space or check the rights of the directory")]
+    #[error("{path}: cannot write the policy: {source}; free some space or check the permissions of the directory")]
     Write {
-        /// The file.
+        /// The policy file.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,

@@ -13,7 +13,7 @@ pub enum Behaviour {
     /// An action drawn from the policy's distribution; uniformly from its range before the first update.
     Gaussian(GaussianPolicy),
     /// An action drawn from the policy's probabilities.
-    Sample(Scores),
+    Softmax(Scores),
     /// The action with the highest score, or with this probability an action drawn uniformly from all.
     EpsilonGreedy(Scores, Epsilon),
 }
@@ -55,7 +55,7 @@ impl Behaviour {
         match self {
             Self::Noise(policy, noise) => Self::Noise(policy.normalising(normalised), noise),
             Self::Gaussian(policy) => Self::Gaussian(policy.normalising(normalised)),
-            Self::Sample(scores) => Self::Sample(scores.normalising(normalised)),
+            Self::Softmax(scores) => Self::Softmax(scores.normalising(normalised)),
             Self::EpsilonGreedy(scores, epsilon) => Self::EpsilonGreedy(scores.normalising(normalised), epsilon),
         }
     }
@@ -64,7 +64,7 @@ impl Behaviour {
     pub fn state_width(&self) -> usize {
         match self {
             Self::Noise(policy, _) => policy.range().width(),
-            Self::Gaussian(_) | Self::Sample(_) | Self::EpsilonGreedy(..) => 0,
+            Self::Gaussian(_) | Self::Softmax(_) | Self::EpsilonGreedy(..) => 0,
         }
     }
 
@@ -73,7 +73,7 @@ impl Behaviour {
         match self {
             Self::Noise(policy, _) => Policy::Deterministic(policy),
             Self::Gaussian(policy) => Policy::Gaussian(policy),
-            Self::Sample(scores) | Self::EpsilonGreedy(scores, _) => Policy::Scored(scores),
+            Self::Softmax(scores) | Self::EpsilonGreedy(scores, _) => Policy::Scored(scores),
         }
     }
 }

@@ -86,7 +86,7 @@ impl ReinforceConfig {
 impl AlgorithmSettings for ReinforceConfig {
     fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
         let policy = shoal_policy::softmax(self.networks(spec).policy, spec, envs)?;
-        Ok(Behaviour::Sample(policy))
+        Ok(Behaviour::Softmax(policy))
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {

@@ -77,6 +77,11 @@ impl EnvironmentConfig {
         }
     }
 
+    /// Whether another program serves it.
+    pub fn is_external(&self) -> bool {
+        !self.server.is_empty()
+    }
+
     /// How long its server may take to start.
     pub fn start_limit(&self) -> Duration {
         Duration::from_secs(self.start_seconds.into())

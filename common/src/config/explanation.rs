@@ -13,7 +13,7 @@ use super::replay::ReplayConfig;
 use super::run::RunConfig;
 use crate::algorithms::{AlgorithmConfig, ExplorationConfig, ObservationConfig, RewardConfig};
 
-/// Every section that the user may write, including those of all algorithms, but without an environment's own
+/// Every section that the user may write, including all algorithms' sections, but without an environment's own
 /// parameters.
 pub fn sections() -> Vec<Section> {
     let environment = Section {

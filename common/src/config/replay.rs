@@ -1,5 +1,6 @@
 //! `[replay]`.
 
+use shoal_base::numbers::COUNTER_LIMIT;
 use shoal_base::section;
 use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
 
@@ -7,9 +8,6 @@ use crate::algorithms::{AlgorithmConfig, TransitionUse};
 
 /// Most transitions in a replay.
 const MAX_ROWS: u64 = 1_000_000_000;
-
-/// More environment steps and updates than any run has.
-const MAX_COUNT: u64 = 1 << 60;
 
 section! {
     /// The replay, and the ratio of updates to environment steps.
@@ -34,11 +32,11 @@ section! {
         /// The environment step from which the ratio counts, if that is later than the warm-up: the ratio was changed
         /// there.
         #[serde(skip_serializing_if = "is_zero")]
-        ratio_since: u64 = 0, bounds: from(0, MAX_COUNT), unit: "environment steps", source: "ours",
+        ratio_since: u64 = 0, bounds: from(0, COUNTER_LIMIT), unit: "environment steps", source: "ours",
             change: Change::ByProgram;
         /// Updates that were allowed before `ratio_since`.
         #[serde(skip_serializing_if = "is_zero")]
-        updates_before: u64 = 0, bounds: from(0, MAX_COUNT), unit: "updates", source: "ours", change: Change::ByProgram;
+        updates_before: u64 = 0, bounds: from(0, COUNTER_LIMIT), unit: "updates", source: "ours", change: Change::ByProgram;
     }
 }
 

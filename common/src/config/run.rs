@@ -31,10 +31,10 @@ section! {
         /// A role is given up, and the run fails, after five failed starts in a row, if they span at least this time
         /// and at least twice its longest start.
         give_up_seconds: u64 = 30, bounds: from(1, 86_400), unit: "s", source: "ours", change: Change::Anytime;
-        /// The run whose networks this one began with, from `--from`.
+        /// The run that supplied the initial networks, from `--from`.
         #[serde(skip_serializing_if = "Option::is_none")]
         from: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
-        /// The dataset with whose rows this one's replay began, from `--demonstrations`.
+        /// The dataset that supplied the initial rows, from `--demonstrations`.
         #[serde(skip_serializing_if = "Option::is_none")]
         demonstrations: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
         /// The format of the text that identifies the run's files. Chosen by the program when the run directory is

@@ -62,7 +62,7 @@ pub trait Environment: Send {
     }
 
     /// The meaning of the numbers of an observation and an action, in the order in which the user sees them. Numbers
-    /// that are not worth watching can be left out. They never change.
+    /// that are not worth watching can be left out. The signals never change.
     fn signals(&self) -> Vec<Signal> {
         Signal::by_number(&self.spec())
     }
@@ -77,9 +77,8 @@ pub trait Environment: Send {
         None
     }
 
-    /// Draws the current state, for films and the report. `action` is the one taken in this state or, where it is not
-    /// known yet, the one that led to it; empty if there is none. An environment that does not draw itself keeps this
-    /// default.
+    /// Draws the current state, for films and the report. `action` is taken in this state or, where it is not known
+    /// yet, led to it; it is empty if there is none. An environment that does not draw itself keeps this default.
     fn draw(&self, _action: &[f64]) -> Option<Drawing> {
         None
     }

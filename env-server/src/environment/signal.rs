@@ -112,7 +112,7 @@ pub struct Goal {
     pub within: f64,
 }
 
-/// What the report draws of an episode, from the signals in `keys` and the ranges of those in `scales`.
+/// What the report draws of an episode, from the signals in `keys`, with the ranges of the signals in `scales`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum Picture {

@@ -41,7 +41,7 @@ pub trait Algorithm {
     /// The layout of the policy's parameters.
     fn layout(&self) -> PolicyLayout;
 
-    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`).
     fn updates(&self) -> u64;
 
     /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It

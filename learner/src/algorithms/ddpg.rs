@@ -55,7 +55,7 @@ pub struct Ddpg {
 }
 
 impl Ddpg {
-    /// New networks, drawn from `seed`. The settings are those of a checked configuration.
+    /// New networks, drawn from `seed`. The settings come from a checked configuration.
     ///
     /// # Errors
     /// When the environment's actions are not real numbers in finite ranges.
@@ -275,7 +275,7 @@ impl AlgorithmDefinition for &config::DdpgConfig {
 }
 
 /// Fills `actions` with the policy's actions, in environment units, and leaves their tanh in `mu.output`. The bits are
-/// those of [`DeterministicPolicy`](shoal_common::network::DeterministicPolicy).
+/// the same as with [`DeterministicPolicy`](shoal_common::network::DeterministicPolicy).
 fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], actions: &mut DMatrix<f32>) {
     mu.forward(parameters, s, &[]);
     for (mut action, mut z) in actions.column_iter_mut().zip(mu.output.column_iter_mut()) {

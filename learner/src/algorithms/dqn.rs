@@ -43,7 +43,7 @@ pub struct Dqn {
 }
 
 impl Dqn {
-    /// A new network, drawn from `seed`. The settings are those of a checked configuration.
+    /// A new network, drawn from `seed`. The settings come from a checked configuration.
     ///
     /// # Errors
     /// When the environment's actions are not discrete, or its observations are not real numbers.

@@ -13,9 +13,9 @@ use super::sampling::Sampler;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// An algorithm that takes gradient steps with minibatches, wherever those come from.
+/// An algorithm that takes gradient steps with minibatches from any source.
 pub trait MinibatchAlgorithm {
-    /// The policy's parameters, without those that normalise observations.
+    /// The policy's parameters, without the statistics of observations.
     fn policy(&self) -> &[f32];
 
     /// Gradient steps taken.
@@ -32,7 +32,8 @@ pub trait MinibatchAlgorithm {
     /// Everything that the next gradient step depends on besides the batch, by name.
     fn state(&self) -> Vec<StateArray<'_>>;
 
-    /// The same numbers, to be overwritten with those after `updates` gradient steps.
+    /// The arrays of `state`, to be overwritten with the state after `updates` gradient steps. Sets the number of
+    /// steps.
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>>;
 }
 
@@ -132,7 +133,7 @@ pub(super) fn targets(batch: &Minibatch, value: impl Fn(usize) -> f32, y: &mut D
     }
 }
 
-/// The mean of the numbers, of which there must be at least one.
+/// The mean of at least one number.
 pub(super) fn mean(numbers: impl ExactSizeIterator<Item = f32>) -> f32 {
     let count = numbers.len() as f32;
     numbers.sum::<f32>() / count

@@ -11,14 +11,14 @@ use crate::replay::Replay;
 /// Added to a variance before its root is taken.
 const VARIANCE_FLOOR: f64 = 1e-8;
 
-/// Sets the number of rows looked at in a state that was saved: those of another replay do not count.
+/// Overwrites the row count of a saved state; a new replay counts from `rows`.
 pub(super) fn set_rows(state: &mut [f32], rows: u64) {
     let halves: [f32; 2] = bytemuck::cast(rows as f64);
     state.iter_mut().zip(halves).for_each(|(number, half)| *number = half);
 }
 
-/// Mean and variance of the observations in the rows of a replay. Each row is counted once: those up to a number that
-/// is part of the state.
+/// Mean and variance of the observations in the rows of a replay. Each row is counted once: the state has the number of
+/// rows counted so far.
 #[derive(Clone, Debug)]
 pub(super) struct Normaliser {
     width: usize,

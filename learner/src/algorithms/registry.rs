@@ -37,8 +37,8 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
     learned.chain(statistics).collect()
 }
 
-/// The state of the algorithm `fresh` with the arrays `weights` of another one's state `saved`. The optimisers begin
-/// anew. The statistics of observations already include `rows` rows of its own replay.
+/// The state of the algorithm `fresh` with the arrays `weights` of another one's state `saved`. The optimisers start
+/// from their initial state. The statistics of observations already include `rows` rows of its own replay.
 ///
 /// # Errors
 /// When the other state lacks a part, or has it in another shape.

@@ -201,7 +201,7 @@ pub struct Sac {
 }
 
 impl Sac {
-    /// New networks, drawn from `seed`. The settings are those of a checked configuration.
+    /// New networks, drawn from `seed`. The settings come from a checked configuration.
     ///
     /// # Errors
     /// When the environment's actions are not real numbers in finite ranges.

@@ -60,7 +60,7 @@ pub struct Td3 {
 }
 
 impl Td3 {
-    /// New networks, drawn from `seed`. The settings are those of a checked configuration.
+    /// New networks, drawn from `seed`. The settings come from a checked configuration.
     ///
     /// # Errors
     /// When the environment's actions are not real numbers in finite ranges.

@@ -14,7 +14,7 @@ fn random(numbers: &mut Stream, count: usize) -> Vec<f32> {
     (0..count).map(|_| numbers.random_range(-2.0..2.0)).collect()
 }
 
-/// A minibatch of random transitions with different discounts; that of the third is 0.
+/// A minibatch of random transitions with different discounts; the third discount is 0.
 pub(super) fn minibatch(seed: u64, row: RowLayout, size: usize) -> Minibatch {
     let mut numbers = stream(seed, Purpose::Environment, 0, 0);
     let mut batch = Minibatch::new(row, size);
@@ -100,7 +100,7 @@ pub(super) fn copy_state<A: MinibatchAlgorithm>(from: &A, to: &mut A) {
     }
 }
 
-/// Asserts that an algorithm, made anew by `new`, ends with the same numbers on two threads as on one.
+/// Asserts that an algorithm, made by `new` each time, ends with the same numbers on two threads as on one.
 pub(super) fn assert_threads_do_not_change_the_bits<A: MinibatchAlgorithm>(
     new: impl Fn() -> A + Sync,
     row: RowLayout,

@@ -10,7 +10,7 @@ const BETA_2: f64 = 0.999;
 const EPSILON: f32 = 1e-8;
 
 /// Moments closer to zero than this become zero. Without a gradient they would decay to denormal numbers, and computing
-/// with those is a hundred times slower. The steps that are dropped are below 1e-18 / ε of the learning rate.
+/// with such numbers is a hundred times slower. The steps that are dropped are below 1e-18 / ε of the learning rate.
 const FIRST_MOMENT_FLOOR: f32 = 1e-18;
 /// As [`FIRST_MOMENT_FLOOR`], for squares. The root of this is negligible beside ε.
 const SECOND_MOMENT_FLOOR: f32 = 1e-30;

@@ -55,7 +55,7 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        // With three or more hidden layers, there are products below the last one that are large enough to share.
+        // With three or more hidden layers, products below the last layer are large enough to share.
         if self.d.len() > 2 {
             let cut = threads.first_share(d.ncols());
             let d = d.as_slice().split_at(cut * d.nrows());
@@ -81,10 +81,54 @@ impl Pass {
         }
     }
 
-    /// The rest of [`backward`](Self::backward) after [`Samples::backward`] for all samples, down to the second layer.
-    /// The threads share the units that a layer's weights are multiplied by, and the gradient that is passed down to
-    /// the first layer.
+    /// Computes ∂L/∂θ. Requires [`forward`](Self::forward), and [`Samples::backward`] down to the second layer (1) for
+    /// all samples. The threads share the units that a layer's weights are multiplied by, and the gradient that is
+    /// passed down to the first layer.
     pub fn gradients(
+        &mut self,
+        threads: &Threads,
+        parameters: &[f32],
+        x: &[f32],
+        d: &DMatrix<f32>,
+        gradient: &mut [f32],
+    ) {
+        let lowest = self.upper_gradients(threads, d, gradient);
+        self.lowest_gradients(threads, parameters, x, d, lowest);
+    }
+
+    /// The gradients of the third layer and of the layers above it. Returns the part of `gradient` for the two lowest
+    /// layers.
+    fn upper_gradients<'a>(&self, threads: &Threads, d: &DMatrix<f32>, gradient: &'a mut [f32]) -> &'a mut [f32] {
+        let last = self.h.len();
+        let mut rest = gradient;
+        for layer in (2..=last).rev() {
+            // The output layer's ∂L/∂z is `d` itself.
+            let d = self.d.get(layer).unwrap_or(d);
+            let (inputs, outputs) = self.layout.layer_size(layer);
+            let range = self.layout.layer_range(layer);
+            let (below, own) = rest.split_at_mut(range.weights.start);
+            rest = below;
+            let (w, b) = own.split_at_mut(range.weights.len());
+            let d = Columns::new(d.as_slice(), outputs);
+            let h = Columns::new(self.h[layer - 1].as_slice(), inputs);
+            if layer == last {
+                weight_gradient(d.as_mat(), h.as_mat(), matrix_mut(w, outputs));
+            } else {
+                let cut = threads.first_share(inputs);
+                let h = (h.rows(0, cut), h.rows(cut, inputs - cut));
+                let w = matrix_mut(w, outputs).split_at_col_mut(cut);
+                threads.both(
+                    || weight_gradient(d.as_mat(), h.0.as_mat(), w.0),
+                    || weight_gradient(d.as_mat(), h.1.as_mat(), w.1),
+                );
+            }
+            sum_columns(d.iter(), b);
+        }
+        rest
+    }
+
+    /// The gradients of the two lowest layers.
+    fn lowest_gradients(
         &mut self,
         threads: &Threads,
         parameters: &[f32],
@@ -101,40 +145,12 @@ impl Pass {
         } = self;
         let activation = layout.hidden().activation;
         let batch = d.ncols();
-        let last = h.len();
-        // The gradient of the first layer, which is computed below, and those of the layers above it.
+        // ∂L/∂z of the first layer, which is computed below, and of the layers above it.
         let (d1, dz) = dz.split_at_mut(1);
-        // The output layer's is `d` itself.
-        let d_of = |layer: usize| dz.get(layer - 1).unwrap_or(d);
-
-        let mut rest = gradient;
-        for layer in (2..=last).rev() {
-            let (inputs, outputs) = layout.layer_size(layer);
-            let range = layout.layer_range(layer);
-            let (below, own) = rest.split_at_mut(range.weights.start);
-            rest = below;
-            let (w, b) = own.split_at_mut(range.weights.len());
-            let d = Columns::new(d_of(layer).as_slice(), outputs);
-            let h = Columns::new(h[layer - 1].as_slice(), inputs);
-            if layer == last {
-                weight_gradient(d.as_mat(), h.as_mat(), matrix_mut(w, outputs));
-            } else {
-                let cut = threads.first_share(inputs);
-                let h = (h.rows(0, cut), h.rows(cut, inputs - cut));
-                let w = matrix_mut(w, outputs).split_at_col_mut(cut);
-                threads.both(
-                    || weight_gradient(d.as_mat(), h.0.as_mat(), w.0),
-                    || weight_gradient(d.as_mat(), h.1.as_mat(), w.1),
-                );
-            }
-            sum_columns(d.iter(), b);
-        }
-
-        // The two lowest layers.
         let [(inputs, h1), (inputs_2, h2)] = [0, 1].map(|layer| layout.layer_size(layer));
         let second = layout.layer(1, parameters);
         let [g1, g2] = [0, 1].map(|layer| layout.layer_range(layer));
-        let (gradient_1, gradient_2) = rest.split_at_mut(g1.biases.end);
+        let (gradient_1, gradient_2) = gradient.split_at_mut(g1.biases.end);
         let (w1, b1) = gradient_1.split_at_mut(g1.weights.len());
         let (w2, b2) = gradient_2.split_at_mut(g2.weights.len());
         let x = if layout.action_layer() == Some(0) {
@@ -142,7 +158,8 @@ impl Pass {
         } else {
             x
         };
-        let d2 = Columns::new(d_of(1).as_slice(), h2);
+        // With one hidden layer, the second layer is the output layer.
+        let d2 = Columns::new(dz.first().unwrap_or(d).as_slice(), h2);
         sum_columns(d2.iter(), b2);
 
         let cut = threads.first_share(h1);
@@ -280,7 +297,7 @@ impl<'a> Samples<'a> {
 }
 
 /// Turns ∂L/∂h into ∂L/∂z, column by column, by the activation's slope, which follows from h. A column of `h` may be
-/// longer than that of `d`.
+/// longer than a column of `d`.
 fn apply_slope<'a>(activation: Activation, d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
     match activation {
         Activation::Relu => Arch::new().dispatch(Slope {

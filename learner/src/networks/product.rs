@@ -1,4 +1,5 @@
-//! The matrix products of a gradient step: those of the backward pass, and a list of all of them for the benchmark.
+//! The matrix products of a gradient step: the products of the backward pass, and a list of all of them for the
+//! benchmark.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};

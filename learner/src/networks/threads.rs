@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// The threads of a learner: the one that created this, and possibly a second one.
+/// The threads of a learner: the thread that created this, and possibly a second one.
 ///
 /// There are at most two: one takes the first part of the work, the other one the rest.
 #[derive(Clone, Debug)]

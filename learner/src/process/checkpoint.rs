@@ -12,6 +12,7 @@ use bincode::config::{self, Config};
 use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
 use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
+use shoal_common::numbers::COUNTER_LIMIT;
 
 use crate::algorithms::registry;
 use crate::networks::digest;
@@ -27,7 +28,7 @@ const PREVIOUS: &str = "previous.ckpt";
 /// A learner's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counters {
-    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
+    /// Updates: gradient steps, or consumed rows (`TransitionUse`).
     pub updates: u64,
     /// Environment steps of all actors that count for the ratio of updates: rows of the replay.
     pub rows: u64,
@@ -65,7 +66,7 @@ pub enum CheckpointError {
              last checkpoint is intact)"
     )]
     Write {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
@@ -73,7 +74,7 @@ pub enum CheckpointError {
     /// It could not be read. It may be whole.
     #[error("{path}: cannot read the checkpoint: {source}; the file was left as it is")]
     Read {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
@@ -84,7 +85,7 @@ pub enum CheckpointError {
              program"
     )]
     Refused {
-        /// The file.
+        /// The checkpoint file.
         path: PathBuf,
         /// What differs.
         reason: String,
@@ -312,16 +313,13 @@ impl Checkpoints {
     }
 }
 
-/// No run reaches this many updates, rows, episodes or versions, and counting further from here does not overflow.
-const LIMIT: u64 = 1 << 60;
-
 /// Whether this is the error of a broken disk or file system. Other reasons may pass, such as too many open files.
 fn is_damage(error: &io::Error) -> bool {
     Errno::from_io_error(error).is_some_and(|errno| [Errno::IO, Errno::UCLEAN, Errno::BADMSG].contains(&errno))
 }
 
-/// Splits a body into its header and the numbers of each array; `None` unless the lengths add up to the body's and
-/// all counters are below `LIMIT`.
+/// Splits a body into its header and the numbers of each array; `None` unless the lengths add up to the body's and all
+/// counters are below [`COUNTER_LIMIT`].
 fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
     let (mut rest, odd) = body.get(read..)?.as_chunks::<{ size_of::<f32>() }>();
@@ -331,7 +329,7 @@ fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
         episodes,
         policy_version,
     } = header.counters;
-    if updates.max(rows).max(episodes).max(policy_version) >= LIMIT {
+    if updates.max(rows).max(episodes).max(policy_version) >= COUNTER_LIMIT {
         return None;
     }
     let mut arrays = Vec::with_capacity(header.arrays.len());

@@ -27,8 +27,8 @@ impl EvaluationWait {
     }
 
     /// Waits until a policy of the current period has been evaluated, but no longer than `timeout`. If none has been,
-    /// that is the policy just published. If the evaluator dies during the evaluation, its successor evaluates the same
-    /// policy.
+    /// the evaluator evaluates the policy just published. If the evaluator dies during the evaluation, its successor
+    /// evaluates the same policy.
     pub(crate) fn wait(
         &mut self,
         learner: &mut Learner<'_>,

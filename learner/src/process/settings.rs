@@ -56,10 +56,10 @@ pub enum LearnerError {
     /// The last policy cannot be written.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
-    /// The losses are no longer finite.
+    /// A loss is not finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
-        /// Gradient steps taken; for algorithms that use each row once, rows consumed.
+        /// Updates: gradient steps, or consumed rows (`TransitionUse`).
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.
@@ -89,8 +89,8 @@ pub enum SizeError {
     },
 }
 
-/// Bytes that the learner's files need on the disk, for a run in the directory `run`. A replay that exists already is
-/// not counted, nor what a start that was killed has reserved for one.
+/// Bytes that the learner's files need on the disk, for a run in the directory `run`. Not counted are a replay that
+/// exists already, and space that a killed start has reserved for one.
 ///
 /// # Errors
 /// When the files would be too large.

@@ -23,7 +23,7 @@ pub enum ReplayError {
              configuration and program, or move the file away"
     )]
     Refused {
-        /// The file.
+        /// The replay file.
         path: PathBuf,
         /// What differs or is damaged.
         reason: String,
@@ -31,7 +31,7 @@ pub enum ReplayError {
     /// No file can have this layout.
     #[error("{path}: a replay of {ring} rows for {actors} actors cannot be made; choose another capacity")]
     Impossible {
-        /// The file.
+        /// The replay file.
         path: PathBuf,
         /// Rows asked for.
         ring: u64,
@@ -44,7 +44,7 @@ pub enum ReplayError {
              the limit or reduce the replay's capacity"
     )]
     NoSpace {
-        /// The file.
+        /// The replay file.
         path: PathBuf,
         /// Bytes it would have.
         bytes: u64,
@@ -52,12 +52,12 @@ pub enum ReplayError {
         source: io::Error,
     },
     /// The system reports another error.
-    #[error("{path}: cannot {doing} the replay: {source}")]
+    #[error("{path}: cannot {action} the replay: {source}")]
     Io {
-        /// The file.
+        /// The replay file.
         path: PathBuf,
         /// What failed, as a verb.
-        doing: &'static str,
+        action: &'static str,
         /// The system's reason.
         source: io::Error,
     },

@@ -183,11 +183,11 @@ impl Drop for Temporary {
     }
 }
 
-fn io(path: &Path, doing: &'static str) -> impl Fn(io::Error) -> ReplayError {
+fn io(path: &Path, action: &'static str) -> impl Fn(io::Error) -> ReplayError {
     let path = path.to_path_buf();
     move |source| ReplayError::Io {
         path: path.clone(),
-        doing,
+        action,
         source,
     }
 }

@@ -50,8 +50,8 @@ impl Candidate<'_> {
     }
 }
 
-/// Chooses the newest record if all its rows are intact, except those that were being overwritten. Otherwise, the
-/// record under which most of the synced rows are intact, then the one with most rows.
+/// Chooses the newest record if all its rows are intact, except rows that were being overwritten. Otherwise, the record
+/// under which most of the synced rows are intact, then the one with most rows.
 pub(super) fn recover(
     words: &Words,
     offsets: &FileOffsets,
@@ -133,7 +133,7 @@ pub(super) fn recover(
     })
 }
 
-/// What is lost: the record `published`, rows after those of `best`, or rows from `expected` on.
+/// What is lost: the record `published`, rows after the head of `best`, or rows from `expected` on.
 fn warnings(best: &Candidate<'_>, newest: &CommitRecord, published: u64, expected: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if newest.generation() < published {

@@ -52,7 +52,7 @@ impl Replay {
     fn map(path: &Path, layout: &ReplayLayout, offsets: FileOffsets, file: File) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io {
             path: path.into(),
-            doing: "map",
+            action: "map",
             source,
         };
         let words = WritableWords::map(&file, offsets.header).map_err(io)?;
@@ -189,8 +189,8 @@ impl Replay {
         // SYNC POINT with the first Acquire fence of `CommitReader::consistent`. The Release fence is the last one of
         // `CommitRecord::store`.
         self.words.store(self.offsets.published, generation);
-        // After a kill, the stores in the file are those in program order as compiled. This fence keeps the compiler
-        // from moving the next chunk's rows, which are plain stores, before this store.
+        // After a kill, the file has the stores in program order, as compiled. This fence keeps the compiler from
+        // moving the next chunk's rows, which are plain stores, before this store.
         compiler_fence(Ordering::SeqCst);
         observe(hook, WriteStep::Published);
     }

@@ -76,7 +76,7 @@ impl Replay {
     pub(super) fn cannot_sync(&self, source: io::Error) -> ReplayError {
         ReplayError::Io {
             path: self.path.clone(),
-            doing: "sync",
+            action: "sync",
             source,
         }
     }

@@ -120,7 +120,7 @@ fn averaged_points(evaluations: usize) -> usize {
     }
 }
 
-/// The mean of the `averaged_points` points centred on each point; near the ends, of those that exist.
+/// The mean of the `averaged_points` points centred on each point; near the ends, of the points that exist.
 fn smooth(points: &[(f64, f64)], averaged_points: usize) -> Vec<(f64, f64)> {
     let half = averaged_points / 2;
     let mean = |of: &[(f64, f64)]| of.iter().map(|(_, y)| y).sum::<f64>() / of.len() as f64;

@@ -56,7 +56,7 @@ fn middle(image: &Image, colour: [u8; 3]) -> [f64; 2] {
 #[test]
 fn the_pendulums_bob_is_where_its_angle_says() {
     let (config, parameters, pictures, shown) = filmed("name = \"pendulum\"\ntime_limit = 40", 2);
-    // The last picture of an episode is that of its last state.
+    // The last picture of an episode shows its last state.
     assert_eq!(pictures.len(), 2 * 41);
     assert_eq!((pictures[0].0.width, pictures[0].0.height), (160, 140));
     assert!(pictures[..40].iter().all(|(_, delay)| *delay == 5), "real time");

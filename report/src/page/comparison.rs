@@ -25,7 +25,7 @@ pub(super) struct Comparison {
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct RepeatedRuns {
     pub(super) label: String,
-    /// Their indices in the report.
+    /// The indices of the runs in the report.
     pub(super) runs: Vec<usize>,
     /// Over environment steps and over seconds, in the range that all runs cover. `None` for a single run.
     pub(super) by_steps: Option<Spread>,

@@ -53,7 +53,7 @@ pub(super) struct Episode {
 }
 
 impl Played {
-    /// Runs the first evaluation episodes of the run's seed. A failure is no error: its reason is in `why_not`.
+    /// Runs the first evaluation episodes of the run's seed. A failure is not an error: its reason is in `why_not`.
     pub(super) fn of(run: &RunDir, config: &Config, limits: PageLimits) -> Self {
         let why_not = |why_not: String| Self {
             why_not: Some(why_not),
@@ -84,7 +84,7 @@ impl Played {
             ..
         } = description::of_run(run, config)?;
         // Built-in environments are drawn by the page, from their signals.
-        let is_external = !config.environment.server.is_empty();
+        let is_external = config.environment.is_external();
         let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;
         let (mut no_pictures, mut pace) = (None, None);
         if is_external && limits.pictured > 0 {

@@ -35,7 +35,7 @@ pub(super) struct RankedSetting {
     pub(super) label: String,
     /// The number of its runs with a result.
     pub(super) runs: usize,
-    /// How many of them have not finished: their result is that of their last evaluation.
+    /// How many of them have not finished: their result is their last evaluation.
     pub(super) unfinished: usize,
     /// The interquartile mean of their results: without the best and the worst quarter, if there are at least four.
     pub(super) mean: f64,
@@ -65,7 +65,7 @@ pub(super) fn rank(environment: &str, sets: &[RepeatedRuns], runs: &[Run]) -> Op
     if !results.iter().any(|(.., values)| values.len() > 1) {
         return None;
     }
-    // Settings that were trained to the end are not compared with those that were not.
+    // Settings that were trained to the end are not compared with settings that were ended early.
     let any_finished = results.iter().any(|(_, unfinished, _)| *unfinished == 0);
     let is_compared = |unfinished: usize| !any_finished || unfinished == 0;
     let (compared, rest): (Vec<_>, Vec<_>) = results.iter().partition(|(_, unfinished, _)| is_compared(*unfinished));

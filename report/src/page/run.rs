@@ -41,8 +41,8 @@ pub(super) struct Run {
     updates: u64,
     wall_seconds: f64,
     updates_per_step: f64,
-    best: Option<EvaluatedPolicy>,
-    last: Option<EvaluatedPolicy>,
+    best: Option<EvaluationPoint>,
+    last: Option<EvaluationPoint>,
     /// The best policy's final evaluation.
     final_evaluation: Option<FinalPolicyResult>,
     evaluations: Curve,
@@ -73,7 +73,7 @@ enum PageState {
 
 /// An evaluation.
 #[derive(Clone, Copy, Debug, Serialize)]
-struct EvaluatedPolicy {
+struct EvaluationPoint {
     env_steps: u64,
     mean: f64,
     std: f64,
@@ -98,14 +98,14 @@ struct Curve {
     counts: Vec<usize>,
 }
 
-/// LearnerCurves measured over a shorter time, in s, are not shown: they are not meaningful.
-const SPAN: f64 = 0.2;
+/// Rates measured over less than this, in s, are not shown.
+const MIN_RATE_SPAN: f64 = 0.2;
 
 /// The learner's records, averaged if there are more than the page may contain. NaN where nothing was recorded.
 #[derive(Clone, Debug, Serialize)]
 struct LearnerCurves {
     steps: Vec<u64>,
-    /// In s.
+    /// Running time, in s.
     time: Vec<f64>,
     ratio: Vec<f64>,
     env_steps_per_second: Vec<f64>,
@@ -169,8 +169,8 @@ impl Run {
                 .iter()
                 .rev()
                 .find(|row| row.best == 1)
-                .map(EvaluatedPolicy::of),
-            last: evaluation_records.last().map(EvaluatedPolicy::of),
+                .map(EvaluationPoint::of),
+            last: evaluation_records.last().map(EvaluationPoint::of),
             final_evaluation: FinalEvaluation::read(run, now.env_steps)?
                 .and_then(|it| it.of(SavedPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
@@ -198,7 +198,7 @@ impl Run {
     }
 }
 
-impl EvaluatedPolicy {
+impl EvaluationPoint {
     fn of(row: &EvaluationRecord) -> Self {
         Self {
             env_steps: row.env_steps,
@@ -256,7 +256,7 @@ impl Curve {
 
 impl LearnerCurves {
     fn of(mut rows: Vec<LearnerRecord>, points: usize) -> Self {
-        let is_too_short = |i: &usize| rows[*i].wall_seconds - rows[i - 1].wall_seconds < SPAN;
+        let is_too_short = |i: &usize| rows[*i].wall_seconds - rows[i - 1].wall_seconds < MIN_RATE_SPAN;
         let too_short: Vec<usize> = (1..rows.len()).filter(is_too_short).collect();
         for i in too_short {
             (rows[i].env_steps_per_second, rows[i].updates_per_second) = (None, None);
@@ -343,7 +343,7 @@ fn environment_label(config: &Config) -> String {
         .join(" ")
 }
 
-/// A name for each run: that of its directory, with the parent directory if two runs have the same name.
+/// A name for each run: the name of its directory, with the parent directory if two runs have the same name.
 pub(super) fn names(runs: &[RunDir]) -> Vec<String> {
     let short: Vec<String> = runs.iter().map(RunDir::name).collect();
     let name = |(run, name): (&RunDir, &String)| {

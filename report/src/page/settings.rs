@@ -11,7 +11,7 @@ const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 /// Set by the program, and still a setting that distinguishes runs.
 const ORIGIN: [&str; 2] = ["run.from", "run.demonstrations"];
 
-/// All settings in the order of `config.toml`, except most of those that the program fills in.
+/// All settings in the order of `config.toml`, except most settings that the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();

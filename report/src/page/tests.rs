@@ -190,7 +190,7 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     let run = &data["runs"][0];
     let means = run["evaluations"]["mean"].as_array().unwrap();
     assert!(means.iter().any(|mean| mean == 777.0) && means.len() <= POINTS);
-    // A moving mean over the points is that of all records.
+    // A moving mean over the points equals the moving mean of all records.
     let total = |key: &str| -> f64 {
         let numbers = run["evaluations"][key].as_array().unwrap();
         assert_eq!(numbers.len(), means.len());

@@ -4,7 +4,7 @@ use shoal_run::evaluation::analysis::lake::{ExpectedResult, Values, greedy, risk
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::result::SeedResult;
-use super::{EPISODES, SettingResults, Tests};
+use super::{EPISODES, Measurements, SettingResults};
 
 /// Probabilities of reaching the goal count as equal if they differ by less than this.
 const SAME: f64 = 0.05;
@@ -12,7 +12,7 @@ const SAME: f64 = 0.05;
 pub(super) fn all(
     epsilon: &[SettingResults<'_>; 3],
     alpha: &[SettingResults<'_>; 4],
-    sarsa: &[SeedResult<Tests>],
+    sarsa: &[SeedResult<Measurements>],
     q_star: &Values,
     best: ExpectedResult,
 ) -> Vec<Claim> {
@@ -40,12 +40,12 @@ fn together(thesis: &'static str, criterion: &'static str, ours: String, held: O
 }
 
 /// The probability of reaching the goal between two episodes, as mean over the seeds; NaN without seeds.
-fn reached(seeds: &[SeedResult<Tests>], from: u64, to: u64) -> f64 {
+fn reached(seeds: &[SeedResult<Measurements>], from: u64, to: u64) -> f64 {
     mean(seeds, |tests| tests.reached(from, to))
 }
 
 /// The mean over the seeds; NaN without seeds.
-fn mean(seeds: &[SeedResult<Tests>], of: impl Fn(&Tests) -> f64) -> f64 {
+fn mean(seeds: &[SeedResult<Measurements>], of: impl Fn(&Measurements) -> f64) -> f64 {
     seeds.iter().map(|seed| of(&seed.tests)).sum::<f64>() / seeds.len() as f64
 }
 
@@ -57,11 +57,11 @@ fn format_mean(mean: f64, decimals: usize) -> String {
     format!("{mean:.decimals$}")
 }
 
-fn at_end(seeds: &[SeedResult<Tests>]) -> f64 {
+fn at_end(seeds: &[SeedResult<Measurements>]) -> f64 {
     reached(seeds, EPISODES - 1_000, EPISODES)
 }
 
-fn optimal(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
+fn optimal(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
     let wrong: Vec<Vec<usize>> = good
         .iter()
         .map(|seed| suboptimal_states(&greedy(&seed.tests.q), q_star))
@@ -97,7 +97,11 @@ fn slow(epsilon: &[SettingResults<'_>; 3], best: ExpectedResult) -> Claim {
     )
 }
 
-fn early(low: &[SeedResult<Tests>], good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
+fn early(
+    low: &[SeedResult<Measurements>],
+    good: &[SeedResult<Measurements>],
+    high: &[SeedResult<Measurements>],
+) -> Claim {
     let [low, middle, high_mean] = [low, good, high].map(|seeds| reached(seeds, 500, 2_000));
     together(
         "ε = 0.7 looks as though it will be the best exploration rate early on",
@@ -112,9 +116,9 @@ fn early(low: &[SeedResult<Tests>], good: &[SeedResult<Tests>], high: &[SeedResu
     )
 }
 
-fn late(good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
+fn late(good: &[SeedResult<Measurements>], high: &[SeedResult<Measurements>]) -> Claim {
     let [middle, high_mean] = [good, high].map(|seeds| reached(seeds, 5_000, 8_000));
-    let start = |seeds: &[SeedResult<Tests>]| {
+    let start = |seeds: &[SeedResult<Measurements>]| {
         let values = seeds.iter().map(|seed| highest(&seed.tests, 0));
         spread(values, 2)
     };
@@ -132,21 +136,21 @@ fn late(good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
     )
 }
 
-fn highest(tests: &Tests, state: usize) -> f64 {
+fn highest(tests: &Measurements, state: usize) -> f64 {
     tests.q[4 * state..][..4]
         .iter()
         .map(|q| f64::from(*q))
         .fold(f64::NEG_INFINITY, f64::max)
 }
 
-fn state_six(good: &[SeedResult<Tests>]) -> Claim {
+fn state_six(good: &[SeedResult<Measurements>]) -> Claim {
     let frozen = [0, 1, 2, 3, 4, 6, 8, 9, 10, 13, 14];
-    let lowest = |seed: &SeedResult<Tests>| {
+    let lowest = |seed: &SeedResult<Measurements>| {
         let by_value = |a: &&usize, b: &&usize| highest(&seed.tests, **a).total_cmp(&highest(&seed.tests, **b));
         frozen.iter().min_by(by_value).copied()
     };
-    let dangerous = |seed: &SeedResult<Tests>| risky_states(&greedy(&seed.tests.q)) == [6];
-    let count = |holds: &dyn Fn(&SeedResult<Tests>) -> bool| good.iter().filter(|seed| holds(seed)).count();
+    let dangerous = |seed: &SeedResult<Measurements>| risky_states(&greedy(&seed.tests.q)) == [6];
+    let count = |holds: &dyn Fn(&SeedResult<Measurements>) -> bool| good.iter().filter(|seed| holds(seed)).count();
     Claim {
         thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its \
                  Q-values are the lowest of all",
@@ -165,8 +169,8 @@ fn state_six(good: &[SeedResult<Tests>]) -> Claim {
     }
 }
 
-fn alike(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
-    let difference = |seed: &SeedResult<Tests>| f64::from((seed.tests.q[4 * 6] - seed.tests.q[4 * 6 + 2]).abs());
+fn alike(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
+    let difference = |seed: &SeedResult<Measurements>| f64::from((seed.tests.q[4 * 6] - seed.tests.q[4 * 6 + 2]).abs());
     let [left, right] = [0, 2].map(|action| mean(good, |tests| f64::from(tests.q[4 * 6 + action])));
     together(
         "q*(6, left) = q*(6, right); the learned Q is only close to optimal",
@@ -198,7 +202,7 @@ fn learning_rates(alpha: &[SettingResults<'_>; 4]) -> Claim {
     )
 }
 
-fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &Values) -> Claim {
+fn on_policy(good: &[SeedResult<Measurements>], sarsa: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
     let best = q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let [off, on] = [good, sarsa].map(|seeds| mean(seeds, |tests| highest(tests, 0)));
     together(
@@ -218,21 +222,21 @@ fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &V
 #[cfg(test)]
 mod tests {
     use super::super::super::result::tests::result;
-    use super::super::{EXPERIMENTS, EvaluatedPolicy};
+    use super::super::{EXPERIMENTS, PolicySnapshot};
     use super::*;
     use shoal_run::evaluation::analysis::lake;
 
     /// A seed with these (episodes, probability of reaching the goal) during training, and these action-values at the
     /// end.
-    fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
-        let evaluated = rises.iter().map(|(episodes, reached)| EvaluatedPolicy {
+    fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Measurements> {
+        let evaluated = rises.iter().map(|(episodes, reached)| PolicySnapshot {
             episodes: *episodes,
             exact: ExpectedResult {
                 reached: *reached,
                 steps: 50.0,
             },
         });
-        let tests = Tests {
+        let tests = Measurements {
             q: q.iter().flatten().map(|q| *q as f32).collect(),
             evaluated: evaluated.collect(),
         };

@@ -48,7 +48,7 @@ const BAR: f64 = -165.0;
 
 /// The swing-up from rest at the bottom with the best policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Tests {
+pub(crate) struct Measurements {
     best: Measures,
 }
 
@@ -56,15 +56,15 @@ pub(crate) struct Tests {
 pub(crate) struct PendulumAlgorithms;
 
 impl Family for PendulumAlgorithms {
-    type Tests = Tests;
+    type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
         let best = SwingUp::run(&mut Rollout::new(&policies.config, &policies.best.parameters)?)?;
-        Ok(Tests { best: best.measures() })
+        Ok(Measurements { best: best.measures() })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [sac, td3] = ["pendulum-sac", "pendulum-td3"].map(|name| results.of(name, ""));
         let mut figures = Vec::new();
         for (name, seeds) in [("pendulum-sac", sac), ("pendulum-td3", td3)] {
@@ -82,8 +82,8 @@ impl Family for PendulumAlgorithms {
     }
 }
 
-fn claim(what: &'static str, seeds: &[SeedResult<Tests>]) -> Claim {
-    let mean = |seed: &SeedResult<Tests>| seed.best.evaluation.return_mean;
+fn claim(what: &'static str, seeds: &[SeedResult<Measurements>]) -> Claim {
+    let mean = |seed: &SeedResult<Measurements>| seed.best.evaluation.return_mean;
     Claim {
         thesis: what,
         criterion: "mean return of the best policy at least −165",

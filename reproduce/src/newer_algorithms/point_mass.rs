@@ -13,7 +13,7 @@ use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
 use super::{experiment, learning_curves, stage};
 
-type Seed = SeedResult<Tests>;
+type Seed = SeedResult<Measurements>;
 
 const QUICK_SAC: &[&str] = &[
     "sac.hidden=[16, 16]",
@@ -49,11 +49,11 @@ turns less than 0.02 rad a step at rest; below 0.118 N the static friction holds
 
 /// Test runs of the best policy from all twelve starts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Tests {
+pub(crate) struct Measurements {
     best: Vec<Measures>,
 }
 
-impl Tests {
+impl Measurements {
     fn reached(&self) -> usize {
         self.best.iter().filter(|it| it.final_distance <= REACHED).count()
     }
@@ -76,18 +76,18 @@ impl Tests {
 pub(crate) struct PointMassAlgorithms;
 
 impl Family for PointMassAlgorithms {
-    type Tests = Tests;
+    type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let test_runs = TestRun::from_starts(&mut Rollout::new(&policies.config, &policies.best.parameters)?, &starts)?;
-        Ok(Tests {
+        Ok(Measurements {
             best: test_runs.iter().map(TestRun::measures).collect(),
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
+    fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [r3, r1, r2, td3] = EXPERIMENTS.map(|experiment| (experiment.name, results.of(experiment.name, "")));
         let mut figures = Vec::new();
         for (name, seeds) in [r3, r1, r2, td3] {
@@ -121,7 +121,7 @@ impl Family for PointMassAlgorithms {
     }
 }
 
-fn is_calm(tests: &Tests) -> bool {
+fn is_calm(tests: &Measurements) -> bool {
     tests.turning() < CALM && tests.force() < FRICTION
 }
 
@@ -173,7 +173,7 @@ mod tests {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let test_runs = starts.iter().map(|start| test_run(*start, rest, shake, force, 0.0));
         let best = test_runs.map(|run| run.measures()).collect();
-        result(&EXPERIMENTS[0], number, 100.0, Tests { best })
+        result(&EXPERIMENTS[0], number, 100.0, Measurements { best })
     }
 
     #[test]

@@ -4,9 +4,9 @@ use shoal_run::evaluation::analysis::point_mass::{Measures, NEAR_STARTS, REACHED
 
 use super::super::claim::{Claim, Scope, percent, spread};
 use super::super::result::SeedResult;
-use super::Tests;
+use super::Measurements;
 
-type Seed = SeedResult<Tests>;
+type Seed = SeedResult<Measurements>;
 
 /// A measure of one test run.
 type Measure = fn(&Measures) -> f64;
@@ -276,7 +276,8 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
     ]
 }
 
-/// `before` are the results at the end of the first training, `after` those at the end of the additional training.
+/// `before` are the results at the end of the first training, `after` the results at the end of the additional
+/// training.
 pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     let value = |before: &Seed, after: &Seed, measure: Measure| {
         (near_mean(before, measure), mean(near(&after.tests.last), measure))

@@ -6,7 +6,7 @@ use shoal_report::figure::{self, Agent};
 
 use super::super::report_section::{Figure, FigureWriter};
 use super::super::result::{SeedResult, representative};
-use super::Tests;
+use super::Measurements;
 
 /// The figures of a reward.
 pub(super) struct RewardFigures {
@@ -36,7 +36,7 @@ const R3: RewardFigures = RewardFigures {
     shown: 0..2,
 };
 
-/// The test runs from the starts of section 5.3, and those of the two halves of appendix A.2.
+/// The test runs from the starts of section 5.3, and the test runs of the two halves of appendix A.2.
 const NEAR: Range<usize> = 0..4;
 const FAR: [(Range<usize>, &str, &str); 2] = [(4..8, "far-1", "A.4 to A.7"), (8..12, "far-2", "A.8 to A.11")];
 
@@ -44,7 +44,7 @@ const FAR: [(Range<usize>, &str, &str); 2] = [(4..8, "far-1", "A.4 to A.7"), (8.
 pub(super) fn of_reward(
     writer: &FigureWriter,
     of: &RewardFigures,
-    seeds: &[SeedResult<Tests>],
+    seeds: &[SeedResult<Measurements>],
 ) -> anyhow::Result<Vec<Figure>> {
     let Some(middle) = representative(seeds) else {
         return Ok(Vec::new());
@@ -73,8 +73,8 @@ pub(super) fn of_reward(
     ])
 }
 
-/// The same figures for r3, and those of the test runs from far away.
-pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+/// The same figures for r3, and figures of the test runs from far away.
+pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Measurements>]) -> anyhow::Result<Vec<Figure>> {
     let mut figures = of_reward(writer, &R3, seeds)?;
     if let Some(middle) = representative(seeds) {
         for (range, file, numbers) in FAR {
@@ -91,7 +91,10 @@ pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyho
 }
 
 /// The figures of paths, actions and distances of the agents that have results.
-pub(super) fn of_comparison(writer: &FigureWriter, rewards: [&[SeedResult<Tests>]; 3]) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn of_comparison(
+    writer: &FigureWriter,
+    rewards: [&[SeedResult<Measurements>]; 3],
+) -> anyhow::Result<Vec<Figure>> {
     let named = ["r1", "r2", "r3"].into_iter().zip(rewards);
     let agents: Vec<Agent<'_>> = named
         .filter_map(|(name, seeds)| {
@@ -120,7 +123,7 @@ pub(super) fn of_comparison(writer: &FigureWriter, rewards: [&[SeedResult<Tests>
 }
 
 /// The figures of r2 after the additional training.
-pub(super) fn of_longer(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+pub(super) fn of_longer(writer: &FigureWriter, seeds: &[SeedResult<Measurements>]) -> anyhow::Result<Vec<Figure>> {
     let Some(middle) = representative(seeds) else {
         return Ok(Vec::new());
     };

@@ -35,7 +35,7 @@ pub enum Line<'a> {
     /// A line beyond the rate. It is not for the log, unless it turns out to be one of the last before the program
     /// failed.
     TooMuch(&'a str),
-    /// The number of lines beyond the rate since the last one that was kept.
+    /// The number of lines beyond the rate since the last kept line.
     LeftOut(u64),
 }
 

@@ -54,7 +54,7 @@ pub fn exec_tied(parent: u32, command_line: &[OsString]) -> anyhow::Result<ExitC
     Err(anyhow::Error::from(cause).context(format!("cannot start {}", program.display())))
 }
 
-/// Ties this process to its parent process, whose id is `parent`: it is killed when that one dies.
+/// Ties this process to its parent process, whose id is `parent`: it is killed when the parent dies.
 ///
 /// # Errors
 /// When the parent has died already.

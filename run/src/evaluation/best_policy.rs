@@ -12,7 +12,7 @@ use crate::signals::Interrupt;
 
 /// A policy with its final evaluation.
 #[derive(Clone, Debug, PartialEq)]
-pub struct EvaluatedPolicy {
+pub struct FinalResult {
     /// Which of the two it is now.
     pub policy: SavedPolicy,
     /// How it did.
@@ -27,7 +27,7 @@ struct Candidate {
 }
 
 /// Evaluates the best and the last policy of a run with `env_steps` environment steps. The better one is `best.policy`
-/// afterwards. Records the results and returns them: first that of the kept policy, then that of the last one if it was
+/// afterwards. Records the results and returns them: first the kept policy's, then the last policy's if it was
 /// evaluated. Calls `progress` with the policy and its finished episodes.
 ///
 /// # Errors
@@ -39,7 +39,7 @@ pub fn evaluate_and_keep_best(
     env_steps: u64,
     interrupt: &Interrupt,
     mut progress: impl FnMut(SavedPolicy, u32),
-) -> anyhow::Result<Vec<EvaluatedPolicy>> {
+) -> anyhow::Result<Vec<FinalResult>> {
     let (episodes, seed) = (config.evaluation.final_episodes, config.run.seed);
     let mut candidates = Vec::new();
     for (policy, path) in [
@@ -70,12 +70,12 @@ pub fn evaluate_and_keep_best(
     let entry = |it: &Candidate| FinalPolicyResult::new(it.policy, (it.file.version, it.file.env_steps), &it.summary);
     let result = FinalEvaluation::new(seed, env_steps, candidates.iter().map(entry).collect(), kept.policy);
     result.write(run)?;
-    let best = EvaluatedPolicy {
+    let best = FinalResult {
         policy: SavedPolicy::Best,
         summary: kept.summary.clone(),
     };
     let last = candidates.iter().filter(|it| it.policy == SavedPolicy::Last);
-    let last = last.map(|it| EvaluatedPolicy {
+    let last = last.map(|it| FinalResult {
         policy: SavedPolicy::Last,
         summary: it.summary.clone(),
     });

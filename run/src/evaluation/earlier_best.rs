@@ -1,4 +1,4 @@
-//! The best policy of a run, evaluated anew where its successors are evaluated in another way than it was.
+//! Evaluates the best policy of a run again if its successors are evaluated in another way than it was.
 
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
@@ -9,12 +9,12 @@ use crate::external_environment::GYMNASIUM;
 use crate::external_environment::server_location::ServerLocation;
 use crate::signals::Interrupt;
 
-/// The best policy's mean return before, and the one now.
+/// The best policy's result before and after it was evaluated again.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReevaluatedPolicy {
-    /// The one stored in `best.policy` before.
+    /// The mean return that `best.policy` had.
     pub before: f64,
-    /// The one stored now.
+    /// The result that it has now.
     pub now: EvaluationSummary,
 }
 
@@ -57,13 +57,13 @@ pub fn reevaluate_best(
     let best = SavedPolicy::Best.read(run, config)?;
     let amount = (config.evaluation.episodes, config.run.seed);
     let now = evaluate_policy(run, config, &best.parameters, amount, interrupt, |_| ())?;
-    let anew = PolicyFile {
+    let updated = PolicyFile {
         return_mean: now.return_mean,
         return_std: now.return_std,
         episodes: now.episodes.into(),
         ..best.clone()
     };
-    anew.write(&run.best_policy())?;
+    updated.write(&run.best_policy())?;
     Ok(Some(ReevaluatedPolicy {
         before: best.return_mean,
         now,

@@ -11,7 +11,7 @@ use crate::evaluation::{EvaluationSummary, SavedPolicy};
 pub struct FinalEvaluation {
     /// The seed of the start states.
     pub seed: u64,
-    /// The run's environment steps at that time. A run that has more now has been resumed.
+    /// The run's environment steps at the evaluation. A run with more steps has been resumed since.
     pub env_steps: u64,
     /// The evaluated policies.
     pub policies: Vec<FinalPolicyResult>,

@@ -14,7 +14,7 @@ use shoal_env_server::vector::{Reset, VectorEnvironment};
 
 use crate::evaluation::frames::{FrameCollector, Frames};
 use crate::external_environment::ExternalEnvironment;
-use crate::external_environment::server_location::ServerSurroundings;
+use crate::external_environment::server_location::LaunchContext;
 use crate::signals::{Interrupt, describe};
 
 /// How often an episode is begun if the environment's server fails in it, each time with a new server.
@@ -64,7 +64,7 @@ pub struct Rollout<'a> {
     environment: RolloutEnvironment,
     policy: Policy,
     parameters: &'a [f32],
-    surroundings: ServerSurroundings,
+    surroundings: LaunchContext,
     interrupt: Interrupt,
 }
 
@@ -88,7 +88,7 @@ impl<'a> Rollout<'a> {
     /// Combines the environment and the network of `config` with these parameters.
     ///
     /// # Errors
-    /// When the number of parameters is not that of the network, or the environment differs from the configuration.
+    /// When the network has another number of parameters, or the environment differs from the configuration.
     pub fn new(config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         let policy = policy_of(config)?;
         let expected = policy.layout().parameters();
@@ -102,7 +102,7 @@ impl<'a> Rollout<'a> {
             environment: RolloutEnvironment::new(config)?,
             policy,
             parameters,
-            surroundings: ServerSurroundings::default(),
+            surroundings: LaunchContext::default(),
             interrupt: Interrupt::default(),
         })
     }
@@ -110,7 +110,7 @@ impl<'a> Rollout<'a> {
     /// As [`new`](Self::new), for a run: an environment that another program serves is started as in training.
     pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         Ok(Self {
-            surroundings: ServerSurroundings::of_run(run, config)?,
+            surroundings: LaunchContext::of_run(run, config)?,
             ..Self::new(config, parameters)?
         })
     }
@@ -133,9 +133,10 @@ impl<'a> Rollout<'a> {
     }
 
     /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures of it, or the reason why
-    /// there are none: a sentence without its full stop. Other programs draw only for a rollout that is
-    /// [`seen`](Self::seen). An episode that may have more steps is played twice: its length decides which states are
-    /// drawn, because drawing takes much longer than stepping. Calls `progress` with the number of steps.
+    /// there are none: a sentence without its full stop. The rollout must be made with
+    /// [`with_pictures`](Self::with_pictures) if another program serves the environment. An episode that may have more
+    /// steps is played twice: its length decides which states are drawn, because drawing takes much longer than
+    /// stepping. Calls `progress` with the number of steps.
     pub fn filmed_episode(
         &mut self,
         (seed, number): (u64, u64),
@@ -237,7 +238,7 @@ fn evaluation(seed: u64, number: u64) -> Reset<'static> {
 
 impl RolloutEnvironment {
     fn new(config: &Config) -> anyhow::Result<Self> {
-        if !config.environment.server.is_empty() {
+        if config.environment.is_external() {
             return Ok(Self::External(None));
         }
         let (name, parameters) = (&config.environment.name, &config.environment.parameters);
@@ -263,7 +264,7 @@ impl RolloutEnvironment {
     fn begin(
         &mut self,
         config: &Config,
-        surroundings: &ServerSurroundings,
+        surroundings: &LaunchContext,
         reset: Reset<'_>,
         interrupt: &Interrupt,
     ) -> anyhow::Result<Vec<f32>> {
@@ -306,8 +307,8 @@ impl RolloutEnvironment {
         }
     }
 
-    /// The picture of the current state, in which `action` will be taken; `None` if there is none. Another program knows
-    /// only the action before, and has written the picture when it reached the state.
+    /// The picture of the current state, in which `action` will be taken; `None` if there is none. Another program
+    /// writes the picture when it reaches the state, so it knows only the action before.
     fn see(&self, action: &[f32]) -> anyhow::Result<Option<Written>> {
         match self {
             Self::Builtin(environment) => {

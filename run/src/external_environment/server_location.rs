@@ -141,7 +141,7 @@ fn is_program(path: &Path) -> bool {
 
 /// Where an environment server that is another program is started, and with which environment variables.
 #[derive(Clone, Debug, Default)]
-pub struct ServerSurroundings {
+pub struct LaunchContext {
     /// Its directory and program. `None`: the current directory, and the program that `PATH` leads to.
     pub location: Option<ServerLocation>,
     /// The environment variable `PYTHONHASHSEED`, which decides the order of Python's sets. `None`: unchanged.
@@ -150,7 +150,7 @@ pub struct ServerSurroundings {
     pub picture_height: Option<u32>,
 }
 
-impl ServerSurroundings {
+impl LaunchContext {
     /// The surroundings of a run's server.
     ///
     /// # Errors

@@ -84,7 +84,8 @@ pub(crate) fn best_for(name: &str) -> anyhow::Result<Option<&'static str>> {
     Ok(best.and_then(of_name).map(|best| best.name))
 }
 
-/// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
+/// Adds the defaults of an algorithm, and its defaults for the environment `name`, to a table. Existing settings are
+/// kept.
 pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static str) -> anyhow::Result<()> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
     let own = of_environments

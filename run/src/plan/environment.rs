@@ -11,7 +11,7 @@ use toml::{Table, Value};
 use super::sections::is_gymnasium;
 use super::source::SettingSources;
 use super::suggestion::{nearest, with_suggestion};
-use crate::external_environment::server_location::{ServerLocation, ServerSurroundings, hash_seed};
+use crate::external_environment::server_location::{LaunchContext, ServerLocation, hash_seed};
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::plan::algorithm;
 use crate::signals::Interrupt;
@@ -48,7 +48,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
     };
     let (environment, spec, description) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let surroundings = ServerSurroundings {
+        let surroundings = LaunchContext {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
             picture_height: None,
@@ -73,7 +73,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
     Ok(description)
 }
 
-/// The error about an environment's own parameters, with the place where the user has set the one at fault.
+/// The error about an environment's own parameters, with the place where the user has set the wrong parameter.
 pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) -> anyhow::Error {
     let Some(of_environment) = error.downcast_ref::<EnvironmentError>() else {
         return error;
@@ -96,7 +96,7 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
     sources.error_naming_source(&format!("environment.{key}"), &text)
 }
 
-/// Takes a key of `[environment]` that is no parameter of the environment.
+/// Takes a key of `[environment]` that is not a parameter of the environment.
 fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
     let Some(value) = section.remove(key) else {
         return Ok(None);

@@ -98,7 +98,7 @@ impl RunOverrides {
     /// The overrides of arguments that [`arguments`](Self::arguments) has returned.
     ///
     /// # Errors
-    /// When they are no such arguments.
+    /// When there is another argument among them.
     pub fn from_arguments(arguments: &[String]) -> anyhow::Result<Self> {
         #[derive(Parser)]
         struct Arguments {
@@ -199,7 +199,7 @@ fn did_you_mean(key: &str, table: &Table) -> String {
     let sections = explanation::sections();
     let having = sections.iter().filter(|of| of.keys.iter().any(|own| own.name == key));
     let all: Vec<&str> = having.map(|section| section.name).collect();
-    // That of a Gymnasium environment is not known yet.
+    // The algorithm of a Gymnasium environment is not known yet.
     let name = table.get("environment").and_then(|section| section.get("name"));
     let is_known = !name
         .and_then(Value::as_str)

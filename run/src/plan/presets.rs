@@ -1,6 +1,6 @@
 //! The built-in configurations: the files of `presets/`.
 //!
-//! A preset has the name of its task. One for another algorithm than the task's first one has the name
+//! A preset has the name of its task. A preset for another algorithm than the task's first has the name
 //! `TASK-ALGORITHM`, and is found by that name.
 
 use shoal_common::config::AlgorithmConfig;
@@ -62,7 +62,7 @@ pub(super) fn with_algorithm(name: &str, algorithm: &str) -> Option<&'static str
         .map(|(name, _)| name)
 }
 
-/// The name of a preset without that of its algorithm, if it ends with one.
+/// The name of a preset without its algorithm's name, if it ends with one.
 fn task(name: &str) -> &str {
     let stem = |algorithm| name.strip_suffix(algorithm)?.strip_suffix('-');
     let mut stems = algorithm::names().filter_map(stem);
@@ -90,13 +90,11 @@ mod tests {
     fn every_preset_is_a_configuration() {
         for name in preset_names() {
             let config = resolve_with(name, &[]).unwrap();
-            let limit = if name.starts_with("frozen-lake") { 100 } else { 200 };
-            assert_eq!(config.spec.time_limit, limit, "{name}");
-            assert!(
-                !config.environment.parameters.is_empty(),
-                "every parameter is set: {:?}",
-                config.environment
-            );
+            let parameters = &config.environment.parameters;
+            let made = shoal_env_server::environment::make(&config.environment.name, &Table::new()).unwrap();
+            let resolved = shoal_env_server::environment::resolve(&config.environment.name, parameters).unwrap();
+            assert_eq!(parameters, &resolved, "{name}: every parameter is set");
+            assert_eq!(config.spec.time_limit, made.spec().time_limit, "{name}");
         }
     }
 

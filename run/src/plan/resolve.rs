@@ -87,11 +87,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
     if let Some(dataset) = overrides.demonstrations_from_anywhere()? {
         put(&mut table, &["run", "demonstrations"], dataset.into())?;
     }
-    let mut config = Config::from_table(table.clone(), "").map_err(|error| {
-        let message = error.to_string();
-        let message = message.strip_prefix(": ").unwrap_or(&message);
-        sources.explain(message.into(), what, &table)
-    })?;
+    let mut config = Config::from_settings(&table).map_err(|error| sources.explain(error.to_string(), what, &table))?;
     // A short run must end with an evaluation too.
     if config.run.steps < config.evaluation.every {
         config.evaluation.every = config.run.steps;
@@ -140,7 +136,7 @@ fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow
     Ok(())
 }
 
-/// Sets the shapes of the networks of the `--from` run, except those that the user has set.
+/// Sets the shapes of the networks of the `--from` run, except keys that the user has set.
 fn set_from_predecessor(
     table: &mut Table,
     sources: &mut SettingSources,

@@ -38,7 +38,7 @@ pub struct RequestedChanges {
 pub struct Revision {
     /// The configuration from now on.
     pub config: Config,
-    /// Where it differs from what the run was last used with, each with who has changed it.
+    /// The differences from what the run was last used with, each with the file or option that changed it.
     changes: Vec<(Difference, String)>,
     /// Whether `config.toml` says something else.
     rewrite: bool,
@@ -76,10 +76,7 @@ impl Revision {
         }
         let explain = |message: String, table: &Table| sources.explain(message, &origin, table);
         read_counts(&mut table).map_err(|error| explain(error.0, &table))?;
-        let mut config = Config::from_table(table.clone(), "").map_err(|error| {
-            let message = error.to_string();
-            explain(message.strip_prefix(": ").unwrap_or(&message).into(), &table)
-        })?;
+        let mut config = Config::from_settings(&table).map_err(|error| explain(error.to_string(), &table))?;
         set_from_length(&mut config, &mut SettingSources::default());
         let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
         // These two are in the other file alone, because `config.toml` is written before a change is final.
@@ -96,7 +93,7 @@ impl Revision {
             let rows = replay_rows(run)?;
             (config.replay.ratio_since, config.replay.updates_before) = (rows, used.replay.allowed_updates(rows));
         }
-        let who = |key: &str| match sources.of(key) {
+        let set_by = |difference: &Difference| match sources.of(&difference.key) {
             SettingSource::Option(option) => option.into(),
             SettingSource::Set => "--set".into(),
             _ => "config.toml".into(),
@@ -105,8 +102,10 @@ impl Revision {
             rewrite: edited.as_ref() != Some(&as_written(&config)),
             changes: differences
                 .into_iter()
-                .map(|it| (who(&it.key), it))
-                .map(|(who, it)| (it, who))
+                .map(|difference| {
+                    let set_by = set_by(&difference);
+                    (difference, set_by)
+                })
                 .collect(),
             config,
         })
@@ -287,7 +286,7 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     {
         bail!(
             "{}: cannot change now: this lockstep run was killed, and the learner repeats updates on rounds that were \
-             collected already; `shoal resume {here}` and then `shoal stop {here}` bring it to a definite step",
+             collected already; `shoal resume {here}` and then `shoal stop {here}` let the learner catch up",
             first.key
         );
     }
@@ -301,7 +300,7 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     Ok(())
 }
 
-/// The number of the newest round of which a part is in the replay; 0 without a replay.
+/// The number of the newest round that the replay has rows of; 0 without a replay.
 fn newest_round(config: &Config, run: &RunDir) -> anyhow::Result<u64> {
     let Some(commits) = CommitReader::open_if_ready(&run.replay_file())? else {
         return Ok(0);

@@ -1,5 +1,5 @@
-//! The sections that a configuration begins with: those of a preset, a file or a Gymnasium environment, for the
-//! algorithm that is asked for.
+//! The sections that a configuration begins with, for the algorithm that is asked for. They come from a preset, a file
+//! or a Gymnasium environment.
 
 use std::path::{Path, PathBuf};
 

@@ -103,7 +103,7 @@ impl SettingSources {
         sources
     }
 
-    /// Adds the keys of `now` that `before` does not have, except those of the environment.
+    /// Adds the keys of `now` that `before` does not have, except the environment's keys.
     pub(super) fn add_new(&mut self, before: &Table, now: &Table, source: &SettingSource) {
         for (section, keys) in now
             .iter()

@@ -15,7 +15,7 @@ pub(super) fn nearest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a s
 }
 
 /// The message with a suggestion, if it is serde's about an unknown word. Such a message names the word and the known
-/// ones between backticks.
+/// words between backticks.
 pub(super) fn with_suggestion(message: String) -> String {
     let unknown = ["unknown field `", "unknown variant `"];
     let Some(start) = unknown.iter().find_map(|words| message.find(words)) else {

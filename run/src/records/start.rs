@@ -44,7 +44,8 @@ impl StartRecord {
         }
     }
 
-    /// The record of the run or suite in this directory; `None` if there is none, as in those of earlier versions.
+    /// The record of the run or suite in this directory; `None` if there is none, as in runs and suites of earlier
+    /// versions.
     ///
     /// # Errors
     /// When the file cannot be read, is damaged or has another format.

@@ -10,8 +10,8 @@ use crate::status::replay_rows;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-/// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
-/// second behind, and take longer to read. Rows that it began with do not count.
+/// The share of its steps, or of its episodes, that a run has done. Steps are counted in the replay: the records are
+/// half a second behind, and take longer to read. Initial rows do not count.
 pub fn share_done(run: &Path) -> f64 {
     let of_steps = || {
         let run = RunDir::open(run).ok()?;

@@ -53,10 +53,10 @@ pub trait Observer {
 }
 
 /// Trains all runs of the suite in this directory that have not finished, `jobs` at a time, or as many as the machine
-/// allows. The caller has locked the suite. Returns how many runs have failed, without those that were ended early.
+/// allows. The caller has locked the suite. Returns how many runs have failed. Runs that were ended early do not count.
 ///
 /// # Errors
-/// When a run cannot be read or is running, or halving has nothing to judge by. A run that fails is no error.
+/// When a run cannot be read or is running, or halving has nothing to judge by. A run that fails is not an error.
 pub fn train(
     suite: &mut Suite,
     directory: &Path,
@@ -149,7 +149,7 @@ impl<'a> Due<'a> {
         observer.begin(suite, &numbers, until);
         failed.retain(|number| !numbers.contains(number));
         let work = |number: usize, events: &Sender<Event>| {
-            // A closed channel is no reason to stop.
+            // A closed channel does not end the work.
             let _ = events.send(Event::Started(number));
             let trial = &suite.trials[number];
             let run = directory.join(&trial.name);

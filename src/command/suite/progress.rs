@@ -1,4 +1,4 @@
-//! The progress of a suite: a live line, or a line for each event where standard error is no terminal.
+//! The progress of a suite: a live line, or a line for each event where standard error is not a terminal.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::io::IsTerminal;
@@ -67,7 +67,7 @@ impl Observer for SuiteProgress<'_> {
 struct TrainingProgress {
     /// The directories of all runs of the suite, by the numbers of their trials.
     runs: Vec<PathBuf>,
-    /// Their names.
+    /// The names of the runs.
     names: Vec<String>,
     bar: ProgressBar,
     live: bool,

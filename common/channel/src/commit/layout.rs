@@ -22,7 +22,7 @@ const BLOCK: usize = 4096;
 /// Words of the preamble, including its checksum.
 const PREAMBLE_WORDS: usize = 10;
 
-/// Words of a commit record before those of the actors: generation, head, tail.
+/// Words of a commit record before the actors' words: generation, head, tail.
 pub(super) const RECORD_WORDS: usize = 3;
 /// Words of an actor in a commit record, before its snapshot: incarnation, sequence, rows.
 pub(super) const ACTOR_WORDS: usize = 3;

@@ -18,8 +18,8 @@ pub struct CommitMirror {
 }
 
 impl CommitMirror {
-    /// Opens the copy at `path`, and continues with what is in it. A file that is missing, or is not a whole copy of
-    /// this layout, is made anew.
+    /// Opens the copy at `path`, and continues with what is in it. If it is missing, or not a whole copy of this
+    /// layout, a new one is made.
     ///
     /// # Errors
     /// When the layout is impossible, or the file cannot be written.

@@ -2,6 +2,8 @@
 
 use std::sync::atomic::{Ordering, fence};
 
+use shoal_base::numbers::COUNTER_LIMIT;
+
 use super::layout::{ACTOR_WORDS, RECORD_WORDS, ReplayLayout};
 use super::words::{Words, WritableWords};
 
@@ -16,8 +18,8 @@ pub struct ChunkId {
     pub sequence: u64,
 }
 
-/// More processes than any run starts, and far below overflow.
-pub const MAX_INCARNATION: u64 = 1 << 60;
+/// The greatest incarnation that is accepted.
+pub const MAX_INCARNATION: u64 = COUNTER_LIMIT;
 
 impl ChunkId {
     /// Whether this chunk comes right after `committed`: it has the next sequence number of the same incarnation, or it
@@ -59,8 +61,6 @@ const ACTORS: usize = RECORD_WORDS;
 const WORD: usize = size_of::<u64>();
 /// The seal of a slot whose record is being written. No finished record has it: see `seal`.
 const OPEN: u64 = 0;
-/// More rows and records than any run will write.
-const LIMIT: u64 = 1 << 60;
 
 impl CommitRecord {
     /// The record of an empty replay of this layout, which must have [`offsets`](ReplayLayout::offsets).
@@ -112,8 +112,8 @@ impl CommitRecord {
         self.words[HEAD] += rows;
     }
 
-    /// Adds rows that belong to no actor: those of another replay.
-    pub fn add_inherited_rows(&mut self, rows: u64) {
+    /// Adds initial rows, which belong to no actor.
+    pub fn add_initial_rows(&mut self, rows: u64) {
         self.words[HEAD] += rows;
     }
 
@@ -172,9 +172,9 @@ impl CommitRecord {
         for (i, word) in record.words.iter_mut().enumerate() {
             *word = words.load(offset + (1 + i) * WORD);
         }
-        // `LIMIT` keeps sums of a file's numbers from overflowing. No actor has more rows than all actors together.
+        // No actor has more rows than all actors together.
         let possible = record.tail() <= record.head()
-            && record.head().max(record.generation()) < LIMIT
+            && record.head().max(record.generation()) < COUNTER_LIMIT
             && (0..layout.actors).all(|actor| record.actor(actor).rows <= record.head());
         (words.load(offset) == record.seal() && possible).then_some(record)
     }

@@ -382,7 +382,7 @@ impl EnvironmentClient {
         }
     }
 
-    /// Sends a request to `server`, which must be looked up before this call: one that is found later may not have
+    /// Sends a request to `server`, which must be looked up before this call: a server that is found later may not have
     /// received the request. If another server takes its place in between, the request counts as lost and is sent
     /// again.
     fn send(

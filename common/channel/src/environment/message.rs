@@ -43,8 +43,8 @@ impl RequestKind {
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) kind: u32,
-    /// Number of evaluation episodes of [`RequestKind::ResetToEvaluation`], of which `episode` is the first; 0 means no
-    /// limit. An environment whose next episode would be beyond them is not reset again.
+    /// Number of evaluation episodes of [`RequestKind::ResetToEvaluation`], from `episode` on; 0 means no limit. An
+    /// environment whose next episode would be beyond them is not reset again.
     pub episodes: u32,
     /// The episode of [`RequestKind::ResetToTraining`], or the first episode of [`RequestKind::ResetToEvaluation`].
     pub episode: u64,
@@ -65,7 +65,7 @@ impl RequestHeader {
 #[repr(u32)]
 pub(super) enum ResponseStatus {
     Answered = 0,
-    /// A step or a snapshot before a reset or a restore: the server is not the one that began the episode.
+    /// A step or a snapshot before a reset or a restore: another server began the episode.
     NotStarted = 1,
     /// The request has the wrong length, invalid contents, or an unknown kind.
     Refused = 2,

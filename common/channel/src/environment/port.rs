@@ -111,8 +111,7 @@ impl Request<'_> {
         self.request.user_header().episode
     }
 
-    /// The number of evaluation episodes, of which [`episode`](Self::episode) is the first; `None` if there is no
-    /// limit.
+    /// The number of evaluation episodes, from [`episode`](Self::episode) on; `None` if there is no limit.
     pub fn episodes(&self) -> Option<u32> {
         Some(self.request.user_header().episodes).filter(|episodes| *episodes > 0)
     }

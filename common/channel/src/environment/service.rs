@@ -15,7 +15,7 @@ use crate::error::ChannelError;
 use crate::memory;
 use crate::service::{HeldService, OpenMode, service_name};
 
-/// Requests that may wait for a response: the current one, and those that a killed server left unanswered.
+/// Requests that may wait for a response: the current one, and requests that a killed server left unanswered.
 const ACTIVE_REQUESTS: usize = 4;
 const LOANED_REQUESTS: usize = 2;
 /// Unread responses to one request.

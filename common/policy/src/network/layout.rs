@@ -62,7 +62,7 @@ impl NetworkLayout {
     }
 
     /// The same network, which normalises its inputs or not. If it does, a mean and a factor for each input follow the
-    /// layers in the parameter slice ([`normalise`](super::normalise)).
+    /// layers in the parameter slice ([`normalise`](super::normalise())).
     pub fn normalising(self, normalised: bool) -> Self {
         Self { normalised, ..self }
     }
@@ -160,9 +160,9 @@ impl NetworkLayout {
 
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
-    /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
-    /// the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if the inputs
-    /// are normalised, so that no two layouts hash the same numbers.
+    /// With two ReLU layers it is the fingerprint in files from before other networks existed. For any other list the
+    /// length and the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if
+    /// the inputs are normalised, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
         let joined = (layers.len() > 1 && self.action_layer() == Some(0)).then_some(1);

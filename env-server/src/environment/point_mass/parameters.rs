@@ -10,7 +10,7 @@ use super::{
 };
 
 /// Parameters of the point mass. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"`, and the reward's parameters are keys
-/// beside it; those of another reward are refused.
+/// beside it; parameters of another reward are refused.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "PointMassTable", into = "PointMassTable")]
 pub struct PointMassParameters {

@@ -52,7 +52,8 @@ fn lists() -> [Hidden; 3] {
     [Hidden::relu([9, 7]), Hidden::tanh([9]), Hidden::relu([8, 9, 7])]
 }
 
-/// The actor's loss by the definition, in `f64`. The density of tanh u is that of u divided by the slope of tanh.
+/// The actor's loss by the definition, in `f64`. The density of tanh u is the density of u divided by the slope of
+/// tanh.
 fn actor_loss(sac: &Sac, phi: &[f64], batch: &Minibatch) -> f64 {
     let of_sample = |i: usize| {
         let s = wide(batch.s.column(i).as_slice());

@@ -61,7 +61,7 @@ impl ExpectedResult {
     }
 }
 
-/// The action with the highest value in each state; among equal ones the first.
+/// The action with the highest value in each state; among equal values the first.
 pub fn greedy(table: &[f32]) -> [usize; STATES] {
     std::array::from_fn(|state| argmax(&table[state * ACTIONS..][..ACTIONS]))
 }

@@ -1,4 +1,5 @@
-//! Beginning with rows that no actor of the run has sent: those of another replay, or others.
+//! The initial rows: rows that a replay begins with, which belong to no actor. They come from another replay or a
+//! dataset.
 
 use std::sync::atomic::{Ordering, fence};
 
@@ -10,7 +11,7 @@ const AT_ONCE: u64 = 4_096;
 
 impl Replay {
     /// Fills this empty replay with the newest rows of another one, at most `most` and at most a ring, and syncs them.
-    /// They belong to no actor. Returns their number.
+    /// Returns their number.
     ///
     /// # Errors
     /// When the file cannot be synced.
@@ -24,14 +25,13 @@ impl Replay {
         self.begin_with(rows.end - first, |index| other.row(first + index))
     }
 
-    /// Fills this empty replay with these rows, one after the other, and syncs them. They belong to no actor. Returns
-    /// their number.
+    /// Fills this empty replay with these rows, one after the other, and syncs them. Returns their number.
     ///
     /// # Errors
     /// When the file cannot be synced.
     ///
     /// # Panics
-    /// If this replay is not empty, if these are no whole rows, or if they are more than a ring.
+    /// If this replay is not empty, if the last row is not whole, or if there are more rows than in a ring.
     pub fn begin_with_rows(&mut self, numbers: &[f32]) -> Result<u64, ReplayError> {
         let width = self.layout.row.width();
         assert!(numbers.len().is_multiple_of(width), "rows of another layout");
@@ -55,7 +55,7 @@ impl Replay {
         }
         // The rows are in the file before a record names them.
         fence(Ordering::Release);
-        self.record.add_inherited_rows(count);
+        self.record.add_initial_rows(count);
         self.publish(self.record.generation() + 1);
         self.flush()?;
         Ok(count)
