@@ -217,7 +217,8 @@ fn a_stop_that_comes_after_the_last_step_is_refused() {
     let place = Workplace::new();
     let long = ["--steps", "3000", "--set", "evaluation.final_episodes=20000"];
     let running = place.start("run", &long);
-    until("the learner is done", || running.log().contains("learner-0 done"));
+    let is_done = |line: &str| line.starts_with("learner-0 ") && line.ends_with(" done");
+    until("the learner is done", || running.log().lines().any(is_done));
     running.signal(Signal::STOP);
     let stop = place.shoal(&["stop", "run"]).stderr(Stdio::piped()).spawn().unwrap();
     std::thread::sleep(std::time::Duration::from_millis(500));

@@ -51,10 +51,17 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
             .collect(),
         Some(total) => share_total(total, &named, hosts)?,
     };
+    let most = max_actors.min(ActorsConfig::MAX_ON_A_HOST);
+    if let [here] = shares[..]
+        && !(1..=most).contains(&here)
+    {
+        return Err(format!(
+            "this run can have 1 to {most} actors (actors.max, fixed when it was created)"
+        ));
+    }
     if shares.contains(&0) {
         return Err("a host has at least 1 actor; to free it altogether, end its `shoal join`".into());
     }
-    let most = ActorsConfig::MAX_ON_A_HOST;
     if shares.iter().any(|share| *share > most) {
         return Err(format!("a host has at most {most} actors"));
     }
@@ -62,20 +69,12 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
     if sum <= u64::from(max_actors) {
         return Ok(shares);
     }
-    Err(if hosts.len() == 1 {
-        format!("this run can have 1 to {max_actors} actors (actors.max, fixed when it was created)")
-    } else {
-        let others: u32 = hosts
-            .iter()
-            .zip(&shares)
-            .filter(|(host, _)| host.name.is_some())
-            .map(|(_, share)| share)
-            .sum();
-        format!(
-            "that would be {sum} actors: the run may have {max_actors} on all hosts together (actors.max, fixed when it \
-             was created), and other hosts have {others}"
-        )
-    })
+    let of_joined = hosts.iter().zip(&shares).filter(|(host, _)| host.name.is_some());
+    let others: u32 = of_joined.map(|(_, share)| share).sum();
+    Err(format!(
+        "that would be {sum} actors: the run may have {max_actors} on all hosts together (actors.max, fixed when it was \
+         created), and other hosts have {others}"
+    ))
 }
 
 fn share_total(total: u32, named: &[Option<u32>], hosts: &[ActorHost]) -> Result<Vec<u32>, String> {

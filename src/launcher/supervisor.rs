@@ -236,17 +236,9 @@ impl Supervisor {
     /// it is tried again later. Returns whether there is a process.
     ///
     /// # Errors
-    /// When the counter of incarnations cannot be written, or the system has refused for too long.
+    /// When the system has refused for too long.
     fn start(&mut self, i: usize) -> anyhow::Result<bool> {
-        let incarnation = self.take_incarnations(1)?;
-        let child = &mut self.children[i];
-        child.instance.incarnation = incarnation;
-        let writer = match child.instance.role {
-            Role::EnvServer => self.server_output,
-            _ => Writer::Shoal,
-        };
-        let started = Process::start(child.instance, &self.run, &self.log, writer);
-        let process = match started {
+        let process = match self.start_process(i) {
             Ok(process) => process,
             Err(error) => return self.handle_refused_start(i, error).map(|()| false),
         };
@@ -255,6 +247,17 @@ impl Supervisor {
             .note(&name(child.instance), &format!("started as process {}", process.pid()));
         child.begin(process);
         Ok(true)
+    }
+
+    fn start_process(&mut self, i: usize) -> anyhow::Result<Process> {
+        let incarnation = self.take_incarnations(1)?;
+        let child = &mut self.children[i];
+        child.instance.incarnation = incarnation;
+        let writer = match child.instance.role {
+            Role::EnvServer => self.server_output,
+            _ => Writer::Shoal,
+        };
+        Process::start(child.instance, &self.run, &self.log, writer)
     }
 
     fn handle_refused_start(&mut self, i: usize, error: anyhow::Error) -> anyhow::Result<()> {

@@ -17,7 +17,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
 use support::{
-    Leftovers, QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, output_of, sent,
+    Leftovers, QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, output_of, pids, sent,
     until, wait_for_rows,
 };
 
@@ -830,16 +830,14 @@ fn a_host_whose_run_ends_while_its_relay_starts_ends_too() {
         let log = || std::fs::read_to_string(place.path().join("host/shoal.log")).unwrap_or_default();
         let (mut relay, begun) = (None, Instant::now());
         while relay.is_none() && begun.elapsed() < Duration::from_secs(60) {
-            let log = log();
-            let started = log
-                .lines()
-                .find_map(|line| line.split_once("relay-0 started as process "));
-            relay = started.map(|(_, pid)| Pid::from_raw(pid.trim().parse().unwrap()).unwrap());
+            let started = pids(&log()).into_iter().find(|(who, _)| who == "relay-0");
+            relay = started.and_then(|(_, pid)| Pid::from_raw(pid));
             std::thread::sleep(Duration::from_millis(1));
         }
         let relay = relay.unwrap();
         kill_process(relay, Signal::STOP).unwrap();
-        let is_late = log().contains("relay-0 ready after");
+        let is_ready = |line: &str| line.starts_with("relay-0 ") && line.contains("ready after");
+        let is_late = log().lines().any(is_ready);
         if is_late {
             kill_process(relay, Signal::CONT).unwrap();
             stop(run);

@@ -583,7 +583,7 @@ fn node_of(pid: i32) -> Vec<PathBuf> {
         .collect()
 }
 
-fn pids(log: &str) -> Vec<(String, i32)> {
+pub(crate) fn pids(log: &str) -> Vec<(String, i32)> {
     let started = |line: &str| {
         let pid = line.split_once("started as process ")?.1.trim().parse().ok()?;
         Some((line.split_whitespace().next()?.to_owned(), pid))
