@@ -176,6 +176,10 @@ fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_valu
         whole: _,
         change,
     } = key;
+    let number = match value {
+        Some(Value::Array(_)) => "Each a number",
+        _ => "A number",
+    };
     let value = match value {
         Some(Value::String(word)) if word.is_empty() => String::new(),
         Some(value) => format!(" = {value}"),
@@ -188,7 +192,7 @@ fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_valu
         let _ = writeln!(text, "      One of {}.", choices.join(", "));
     }
     if !bounds.is_empty() {
-        let _ = writeln!(text, "      A number {bounds}.");
+        let _ = writeln!(text, "      {number} {bounds}.");
     }
     if let Some(change) = change {
         let _ = writeln!(text, "      {}", change.in_words());
@@ -247,6 +251,7 @@ mod tests {
         let text = explain_all().unwrap();
         assert!(text.contains("steps = 120000  [environment steps;"), "{text}");
         assert!(text.contains("800000 in point-mass-r1"), "{text}");
+        assert!(text.contains("      Each a number from 1 to 8192.\n"), "{text}");
         let lake = explain_one("frozen-lake", &RunOverrides::default()).unwrap();
         assert!(lake.contains("alpha = 0.03") && !lake.contains("tau"), "{lake}");
         assert!(lake.contains("warmup = 0 "), "{lake}");

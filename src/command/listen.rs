@@ -55,7 +55,7 @@ pub(crate) struct ListenArgs {
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = Endpoint::DEFAULT)]
     pub(crate) listen: Option<String>,
 
-    /// Make new keys. The old `join.key` opens nothing any more.
+    /// Make new keys (with `resume`). The old `join.key` opens nothing any more.
     #[arg(long, requires = "listen")]
     pub(crate) new_keys: bool,
 
