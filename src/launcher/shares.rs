@@ -62,6 +62,7 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
     if shares.contains(&0) {
         return Err("a host has at least 1 actor; to free it altogether, end its `shoal join`".into());
     }
+    let most = ActorsConfig::MAX_ON_A_HOST;
     if shares.iter().any(|share| *share > most) {
         return Err(format!("a host has at most {most} actors"));
     }

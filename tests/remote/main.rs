@@ -17,8 +17,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
 use support::{
-    Leftovers, QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, output_of, pids, sent,
-    until, wait_for_rows,
+    Leftovers, QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, output_of, pids,
+    sent, until, wait_for_rows,
 };
 
 /// Steps that no test reaches.
@@ -413,7 +413,11 @@ fn hosts_wait_for_a_run_that_a_scheduler_ends_and_resumes() {
     let running = place.resume("run", &["--listen", &endpoint, "--hosts-wait"]);
     let run = Run { place, running };
     wait_for_actors(&run, &[1, 2]);
-    assert_eq!(host.running.pids("actor-1").len(), 1, "the host's actors need no restart");
+    assert_eq!(
+        host.running.pids("actor-1").len(),
+        1,
+        "the host's actors need no restart"
+    );
     let path = stop(run);
     let sent = host.sent(&[1, 2]);
     host.ends_with(0);
