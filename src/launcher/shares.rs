@@ -49,6 +49,7 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
             .zip(&named)
             .map(|(host, named)| named.unwrap_or(host.actors))
             .collect(),
+        Some(total) if total > max_actors => return Err(too_many(total.into(), max_actors, hosts)),
         Some(total) => share_total(total, &named, hosts)?,
     };
     let most = max_actors.min(ActorsConfig::MAX_ON_A_HOST);
@@ -70,12 +71,16 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
     if sum <= u64::from(max_actors) {
         return Ok(shares);
     }
-    let of_joined = hosts.iter().zip(&shares).filter(|(host, _)| host.name.is_some());
-    let others: u32 = of_joined.map(|(_, share)| share).sum();
-    Err(format!(
+    Err(too_many(sum, max_actors, hosts))
+}
+
+fn too_many(sum: u64, max_actors: u32, hosts: &[ActorHost]) -> String {
+    let joined = hosts.iter().filter(|host| host.name.is_some());
+    let others: u32 = joined.map(|host| host.actors).sum();
+    format!(
         "that would be {sum} actors: the run may have {max_actors} on all hosts together (actors.max, fixed when it was \
          created), and other hosts have {others}"
-    ))
+    )
 }
 
 fn share_total(total: u32, named: &[Option<u32>], hosts: &[ActorHost]) -> Result<Vec<u32>, String> {
