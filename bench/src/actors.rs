@@ -85,8 +85,8 @@ struct Scaling {
     learning_efficiency: f64,
 }
 
-/// The numbers of actors to measure: those typed by the user, or a default for this number of cores. One actor is
-/// always included, because efficiency is relative to it.
+/// The numbers of actors to measure: the numbers that the user typed, or a default for this number of cores. One actor
+/// is always included, because efficiency is relative to it.
 fn counts(typed: Option<&str>, cores: u32) -> anyhow::Result<Vec<u32>> {
     let mut counts = match typed {
         Some(text) => {

@@ -24,7 +24,7 @@ use super::temporary_run::TemporaryRun;
 const INTERVAL: Duration = Duration::from_millis(100);
 
 /// Share of the time for each of seven measurements: for both minibatch sizes the gradient steps, the fastest product
-/// and all products; and gradient steps on two threads. An algorithm whose minibatches are large has only four.
+/// and all products; and gradient steps on two threads. An algorithm with large minibatches has only four measurements.
 const SHARE: f64 = 1.0 / 7.0;
 
 /// The second minibatch size, large enough that Adam takes little of the time.

@@ -95,7 +95,7 @@ pub(super) struct RemoteFigures {
 }
 
 /// Actors that fill a chunk in a millisecond, on one host behind a cable of 100 Mbit/s; and what the model expects of
-/// 1,024 on 32 hosts with cables of 1 Gbit/s.
+/// 1,024 actors on 32 hosts with cables of 1 Gbit/s.
 #[derive(Serialize)]
 struct ModelFigures {
     rows: Vec<ModelRow>,
@@ -265,8 +265,8 @@ fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> 
     })
 }
 
-/// Compares the model with measurements over a slow cable. The costs of relay, gate and learner are those seen over the
-/// unlimited one.
+/// Compares the model with measurements over a slow cable. The costs of relay, gate and learner were measured over the
+/// unlimited cable.
 fn predict(
     unlimited: &LinkFigures,
     slow: &Network,

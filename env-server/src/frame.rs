@@ -75,7 +75,7 @@ impl FrameFile {
         Some(Self(path.into()))
     }
 
-    /// Writes the drawing that `draw` makes, unless it was not asked for one since the last. A failure is logged.
+    /// Writes the drawing that `draw` makes, if a picture was asked for since the last one. A failure is logged.
     pub(crate) fn write(&self, draw: impl FnOnce() -> Option<Drawing>, fps: Option<f64>) {
         if self.0.exists() {
             return;

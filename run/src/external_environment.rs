@@ -417,7 +417,8 @@ fn open(
     let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
-    std::fs::write(&launch.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
+    std::fs::write(&launch.iceoryx2, domain.iox_config()?)
+        .with_context(|| format!("cannot write {}", launch.iceoryx2.display()))?;
     let mut services = Services::new(domain)?;
     services.create_common(domain)?;
     services.create_environment(domain, launch.index)?;

@@ -40,9 +40,10 @@ fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
         // `origin.json` is written after the networks and rows that the run begins with.
         return Ok(run.config()?.run.has_origin() && Origin::read(run)?.is_none());
     }
-    let entries = std::fs::read_dir(run.path()).with_context(|| format!("cannot read {}", run.path().display()))?;
+    let cannot_read = || format!("cannot read {}", run.path().display());
+    let entries = std::fs::read_dir(run.path()).with_context(cannot_read)?;
     for entry in entries {
-        let name = entry.context("cannot read the directory")?.file_name();
+        let name = entry.with_context(cannot_read)?.file_name();
         let name = name.to_string_lossy();
         if !FIRST_FILES.iter().any(|first| name.starts_with(first)) {
             return Ok(false);

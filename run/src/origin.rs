@@ -128,7 +128,8 @@ impl Beginning {
     /// # Errors
     /// When a file cannot be written.
     pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
-        std::fs::create_dir_all(run.checkpoints()).context("cannot create the directory for checkpoints")?;
+        let checkpoints = run.checkpoints();
+        std::fs::create_dir_all(&checkpoints).with_context(|| format!("cannot create {}", checkpoints.display()))?;
         let origin = match self {
             Self::Run(predecessor) => Origin::Run(predecessor.begin(run, config)?),
             Self::Dataset(demonstrations) => Origin::Dataset(demonstrations.begin(run, config)?),

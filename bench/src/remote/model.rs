@@ -131,7 +131,7 @@ pub(super) struct PolicyAge {
 
 /// The policies of `bytes` bytes that each of `hosts` hosts gets, from a learner that publishes `published` a second
 /// and a gate that sends at most `bandwidth` bytes a second over a link with `link` bytes a second. A host asks for the
-/// next one when it has the last.
+/// next policy when it has the last.
 pub(super) fn policy_age(bytes: f64, hosts: u32, published: f64, bandwidth: f64, link: f64, delay: f64) -> PolicyAge {
     let transfer = bytes / link + delay;
     let of_a_host = (bandwidth.min(link) / (f64::from(hosts) * bytes))

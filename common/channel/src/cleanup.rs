@@ -145,7 +145,7 @@ impl Domain {
             run_id: run_id.into(),
             cause,
         })?;
-        // iceoryx2 would never free a port with an unfinished connection, so those are removed first.
+        // iceoryx2 would never free a port with an unfinished connection, so unfinished connections are removed first.
         let deadline = Instant::now() + MAKER_PATIENCE;
         let listing = || io_error("clean up", Path::new(SHARED_MEMORY));
         while !remove_unfinished(run_id).map_err(listing())? && Instant::now() < deadline {

@@ -180,8 +180,8 @@ impl Domain {
         &self.node
     }
 
-    /// Whether the run's files outside `/dev/shm` still exist, including those of `services` services. Without them the
-    /// processes of the run no longer find each other. What cannot be inspected, as when too many files are open, counts
+    /// Whether the run's files outside `/dev/shm` still exist, including the files of `services` services. Without them
+    /// the processes of the run no longer find each other. What cannot be inspected, as when too many files are open, counts
     /// as existing.
     pub fn is_intact(&self, services: usize) -> bool {
         let Ok(directory) = self.directory() else {

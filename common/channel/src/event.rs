@@ -97,7 +97,7 @@ pub struct Notifier {
 impl Listener {
     /// Bytes of shared memory that an event service reserves in a run of up to `max_actors` actors.
     pub fn reserved(max_actors: usize) -> u64 {
-        // The second file holds pending notifications: iceoryx2 has one of 2103 bytes for each listener.
+        // The second file holds pending notifications: iceoryx2 makes a file of 2103 bytes for each listener.
         memory::service(2 * participants(max_actors)) + memory::pages(2103)
     }
 

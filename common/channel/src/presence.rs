@@ -33,7 +33,7 @@ pub(super) enum Claim {
 }
 
 impl Presence {
-    /// Becomes a member. Where another user has a file of this name, nothing shows that this process is one.
+    /// Becomes a member. Where another user has a file of this name, nothing shows that this process is a member.
     ///
     /// # Errors
     /// When the file cannot be made or locked.

@@ -61,7 +61,8 @@ impl Scores {
         }
     }
 
-    /// The same scores, of normalised observations or not. A table has no observations that could be.
+    /// The same scores, of normalised observations or not. A table's observations are indices, which are never
+    /// normalised.
     pub fn normalising(self, normalised: bool) -> Self {
         let function = match self.function {
             ScoreFunction::Logits(network) => ScoreFunction::Logits(network.normalising(normalised)),

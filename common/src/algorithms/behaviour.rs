@@ -5,7 +5,7 @@ use shoal_policy::{Policy, Scores};
 
 use super::exploration::ExplorationConfig;
 
-/// A policy with its exploration. Each variant is one valid combination, so no other can be made.
+/// A policy with its exploration. Each variant is a valid combination, so an invalid one cannot be made.
 #[derive(Clone, Debug)]
 pub enum Behaviour {
     /// The action of the policy, to which actors add noise.

@@ -109,7 +109,7 @@ pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
 }
 
 impl Graph {
-    /// Adds the layers with the activation between them. The output of the last one is named `output`.
+    /// Adds the layers with the activation between them. The output of the last layer is named `output`.
     fn add_network(&mut self, network: &ExportedNetwork, output: &str) {
         let ExportedNetwork {
             normalisation,

@@ -9,7 +9,7 @@ use shoal_env_server::frame::Image;
 /// How carefully the colours of a picture with more than 256 are chosen: 1 is best, 30 is fastest.
 const SPEED: i32 = 10;
 
-/// Writes pictures one after the other. Each is stored as what has changed since the one before.
+/// Writes pictures one after the other. Each is stored as its difference from the picture before.
 pub(super) struct Animation<W: Write> {
     encoder: Encoder<W>,
     width: usize,

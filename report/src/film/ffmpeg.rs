@@ -35,7 +35,7 @@ pub(super) fn check() -> anyhow::Result<()> {
 /// A running `ffmpeg`. It is ended on drop.
 pub(super) struct Ffmpeg {
     child: Child,
-    /// To the thread that writes to it, so that a program that reads nothing does not block this one.
+    /// Goes to the thread that writes to the program, so that a program that reads nothing does not block this thread.
     pictures: Option<SyncSender<Vec<u8>>>,
     place: TempDir,
 }

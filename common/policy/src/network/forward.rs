@@ -27,9 +27,9 @@ impl<'a> Layer<'a> {
 /// The buffers of a forward pass, one column for each sample.
 #[derive(Debug)]
 pub struct Activations<'a, H> {
-    /// The inputs, followed by the action inputs, if those enter at the first layer; otherwise empty.
+    /// The inputs, followed by the action inputs, if these enter at the first layer; otherwise empty.
     pub joined: &'a mut [f32],
-    /// The outputs of each hidden layer, followed by the action inputs if those enter at the next layer.
+    /// The outputs of each hidden layer, followed by the action inputs if these enter at the next layer.
     pub hidden: H,
     /// The linear outputs of the output layer.
     pub output: &'a mut [f32],

@@ -158,7 +158,8 @@ impl NetworkLayout {
         Layer::at(self.layer_range(layer), parameters)
     }
 
-    /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
+    /// The fingerprint: two layouts have the same fingerprint only if they read parameters alike (FNV-1a over the
+    /// sizes).
     ///
     /// With two ReLU layers it is the fingerprint in files from before other networks existed. For any other list the
     /// length and the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if
