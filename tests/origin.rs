@@ -96,7 +96,7 @@ fn a_run_begins_with_the_weights_of_another_one_and_takes_their_shapes() {
 
     std::fs::remove_file(run.join("origin.json")).unwrap();
     let message = error_line(&place.output(&["resume", "new", "--steps", "300"]));
-    assert!(message.contains("the start of new was interrupted"), "{message}");
+    assert!(message.contains("new was interrupted while it copied"), "{message}");
 }
 
 #[test]
@@ -339,7 +339,7 @@ fn a_replay_begins_with_the_rows_of_a_dataset() {
     // As after a kill while the first files were written.
     std::fs::remove_file(run.join("origin.json")).unwrap();
     let message = error_line(&place.output(&["resume", "new", "--steps", "500"]));
-    assert!(message.contains("the start of new was interrupted"), "{message}");
+    assert!(message.contains("new was interrupted while it copied"), "{message}");
 }
 
 #[test]
