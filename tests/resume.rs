@@ -4,7 +4,7 @@
 
 mod support;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -13,7 +13,7 @@ use rustix::process::Signal;
 use shoal_common::channel::Domain;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
-use support::{Running, Workplace, error_line, parse, until};
+use support::{Running, Workplace, contents, error_line, parse, until};
 
 /// Rows in the ring of a quick run's replay.
 const RING: u64 = 2000;
@@ -111,19 +111,27 @@ fn resume_changes_nothing_before_the_last_role_of_a_killed_launcher_has_ended() 
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
-/// The files in a directory, at any depth, with their bytes.
-fn contents(directory: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(directory).unwrap().map(Result::unwrap) {
-        let path = entry.path();
-        if path.is_dir() {
-            found.append(&mut contents(&path));
-        } else {
-            let bytes = std::fs::read(&path).unwrap();
-            found.insert(path, bytes);
-        }
-    }
-    found
+#[test]
+fn a_run_is_not_removed_before_the_last_role_of_its_killed_launcher_has_ended() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    let run = running.run.clone();
+    wait_for_checkpoints(&running);
+    // For a role that does not end, as above.
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let role = Domain::join(&config.run.id, config.actors.max).unwrap();
+    running.kill_all();
+    let before = contents(&run);
+    let message = error_line(&place.output(&["rm", "--yes", "run"]));
+    let advice = format!("still alive and do not end (stopped?): kill -9 {}", std::process::id());
+    assert!(
+        message.contains("cannot remove ") && message.contains(&advice),
+        "{message}"
+    );
+    assert_eq!(contents(&run), before);
+    role.leave().unwrap();
+    assert!(place.output(&["rm", "--yes", "run"]).status.success());
+    assert!(!run.exists());
 }
 
 #[test]
