@@ -8,7 +8,7 @@ use std::process::Command;
 
 use rustix::process::Signal;
 use shoal_common::channel::Domain;
-use support::{Workplace, error_line, parse, until};
+use support::{QUICK, Workplace, contents, error_line, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
@@ -211,6 +211,33 @@ fn a_run_whose_directory_is_removed_or_replaced_ends_with_one_line() {
             "nothing is written into another directory"
         );
     }
+}
+
+#[test]
+fn nothing_is_written_into_a_run_that_takes_the_place_of_one_in_its_final_evaluation() {
+    let place = Workplace::new();
+    // So many episodes that the evaluation takes seconds.
+    let long = ["--steps", "500", "--set", "evaluation.final_episodes=10000"];
+    let running = place.start_as("run", &[&QUICK[..8], &long].concat());
+    let run = running.run.clone();
+    let outcome = || std::fs::read_to_string(run.join("outcome.json")).unwrap_or_default();
+    until("the final evaluation has begun", || {
+        outcome().contains("final evaluation")
+    });
+    std::fs::rename(&run, place.path().join("kept")).unwrap();
+    place.copy("kept", "run");
+    let before = contents(&run);
+    let (code, printed) = running.wait_for_launcher();
+    let said = place.stderr();
+    assert_eq!((code, printed.as_str()), (Some(1), ""), "{said}");
+    let last = said.lines().last().unwrap();
+    assert!(last.contains("removed or renamed"), "{said}");
+    let after = contents(&run);
+    let changed: Vec<_> = after
+        .iter()
+        .filter(|(path, bytes)| before.get(*path) != Some(bytes))
+        .collect();
+    assert!(changed.is_empty() && before.len() == after.len(), "{:?}", after.keys());
 }
 
 #[test]

@@ -7,12 +7,14 @@ mod support;
 use std::collections::BTreeSet;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use shoal_common::channel::Domain;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
 use support::{Running, Workplace, contents, error_line, parse, until};
 
 /// Rows in the ring of a quick run's replay.
@@ -132,6 +134,33 @@ fn a_run_is_not_removed_before_the_last_role_of_its_killed_launcher_has_ended() 
     role.leave().unwrap();
     assert!(place.output(&["rm", "--yes", "run"]).status.success());
     assert!(!run.exists());
+}
+
+#[test]
+fn nothing_is_written_into_a_run_that_takes_the_place_of_one_that_is_resumed() {
+    let place = Workplace::new();
+    place.train(&["pendulum", "--steps", "500", "--run", "run"]);
+    place.copy("run", "other");
+    let [run, other, kept] = ["run", "other", "kept"].map(|name| place.path().join(name));
+    // So many episodes that the best policy is evaluated again for seconds.
+    let longer = ["--steps", "600", "--set", "evaluation.episodes=10000"];
+    let mut resumed = place.shoal(&[&["resume", "run"], &longer[..]].concat());
+    let resumed = resumed.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    until("the run is locked", || {
+        RunDir::open(&run).unwrap().is_running().unwrap()
+    });
+    let before = contents(&other);
+    std::fs::rename(&run, &kept).unwrap();
+    std::fs::rename(&other, &run).unwrap();
+    let output = resumed.wait_with_output().unwrap();
+    let said = error_line(&output);
+    assert!(said.contains("removed or renamed"), "{said}");
+    let after = contents(&run);
+    assert!(
+        before.len() == after.len() && before.values().eq(after.values()),
+        "{:?}",
+        after.keys()
+    );
 }
 
 #[test]
