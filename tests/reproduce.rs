@@ -244,6 +244,22 @@ fn a_failed_seed_is_reported_missing_and_the_others_continue() {
     assert!(place.path().join("kept/pendulum/seed-2.json").exists() && !results.exists());
 }
 
+/// A seed that trains for minutes.
+const LONG: [&str; 8] = ["reproduce", "pendulum", "--seeds", "1", "--jobs", "1", "--out", "kept"];
+
+#[test]
+fn a_seed_that_was_stopped_has_no_result() {
+    let place = Workplace::new();
+    let [first, _] = runs(&place);
+    let reproduction = Reproduction::start(&place, &LONG);
+    until("the seed trains", || starts(&first) == 1);
+    assert!(place.output(&["stop", first.to_str().unwrap()]).status.success());
+    assert_eq!(reproduction.wait().code(), Some(1), "{}", place.stderr());
+    let failed = "pendulum seed 1: failed: it was stopped before its end";
+    assert!(place.stderr().contains(failed), "{}", place.stderr());
+    assert!(!place.path().join("kept/pendulum.jsonl.gz").exists());
+}
+
 #[test]
 fn every_experiment_of_the_thesis_runs_with_quick() {
     let place = Workplace::new();

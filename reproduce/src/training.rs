@@ -76,16 +76,20 @@ pub(super) fn train(
         }
     }
     command.args(length.arguments()).arg("--quiet");
-    run_training(&mut command, interrupted)
+    let has_finished = || match RunState::of(run)? {
+        RunState::Started(progress) => has_ended(run, length, progress),
+        RunState::Absent => Ok(false),
+    };
+    run_training(&mut command, interrupted, has_finished)
 }
 
 /// Whether a run has reached this length and ended normally there, which leaves its last policy.
 fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<bool> {
     let run = RunDir::open(run)?;
-    if !run.last_policy().exists() {
+    let Some(last) = SavedPolicy::Last.read_if_any(&run, &run.config()?)? else {
         return Ok(false);
-    }
-    let steps = SavedPolicy::Last.read(&run, &run.config()?)?.env_steps;
+    };
+    let steps = last.env_steps;
     Ok(match length {
         Length::Steps(wanted) => steps >= wanted,
         Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps,
