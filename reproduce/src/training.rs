@@ -1,10 +1,10 @@
 //! One training: starts this program as `shoal train` or `shoal resume`.
 
-use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::Command;
 
 use shoal_common::run_dir::{RunDir, RunDirError};
+use shoal_run::child_process::tied;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::interrupted_start::remove_interrupted_start;
 pub(super) use shoal_run::jobs::TrainingEnd;
@@ -57,7 +57,6 @@ pub(super) fn train(
     interrupted: Interrupted<'_>,
 ) -> anyhow::Result<TrainingEnd> {
     let mut command = Command::new("/proc/self/exe");
-    command.arg0("shoal");
     match RunState::of(run)? {
         RunState::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
         RunState::Absent => {
@@ -80,7 +79,8 @@ pub(super) fn train(
         RunState::Started(progress) => has_ended(run, length, progress),
         RunState::Absent => Ok(false),
     };
-    run_training(&mut command, interrupted, has_finished)
+    // Tied to this process: if that is killed, the run ends, and the same command continues it.
+    run_training(&mut tied(&command)?, interrupted, has_finished)
 }
 
 /// Whether a run has reached this length and ended normally there, which leaves its last policy.
