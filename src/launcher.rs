@@ -153,6 +153,24 @@ pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Re
         .inspect_err(|error| record_failed_start(run, error))
 }
 
+/// Waits as [`wait_for_predecessors`] does, but records nothing. The roles of another run that this directory is a copy
+/// of do not count: they use their own directory.
+///
+/// # Errors
+/// When some do not end.
+pub(crate) fn wait_for_roles_here(run_id: &str, run: &RunDir) -> anyhow::Result<()> {
+    let is_another = |error: &DomainError| original_run(error, run).is_some();
+    match Domain::wait_for_earlier_processes(run_id, Duration::ZERO) {
+        Err(error) if is_another(&error) => return Ok(()),
+        Ok(()) => return Ok(()),
+        Err(_) => {}
+    }
+    match Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END) {
+        Err(error) if !is_another(&error) => Err(error.into()),
+        _ => Ok(()),
+    }
+}
+
 /// Records that the run has failed, unless a launcher has recorded how it ended.
 fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
     if run.check().is_ok()
@@ -226,8 +244,19 @@ fn run_once(
 
 /// If the surviving processes belong to a run that this directory is a copy of, names that run in the error.
 fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
-    let DomainError::StillAlive { pids, .. } = &error else {
-        return error.into();
+    match original_run(&error, run) {
+        Some(there) => {
+            let here = run.path().display();
+            anyhow::anyhow!("{here} is a copy of {there}, which is running: stop that run first")
+        }
+        None => error.into(),
+    }
+}
+
+/// The directory of the surviving processes, if they belong to a run that this directory is a copy of.
+fn original_run(error: &DomainError, run: &RunDir) -> Option<String> {
+    let DomainError::StillAlive { pids, .. } = error else {
+        return None;
     };
     // Only roles name their directory in a fixed place: their arguments are role, run directory and two numbers.
     let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner, Role::Gate].map(Role::name);
@@ -238,15 +267,8 @@ fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
         let is_role = roles.contains(&arguments.next()?);
         arguments.next().filter(|_| is_role).map(str::to_owned)
     };
-    let here = run.path().display();
-    match pids
-        .iter()
-        .find_map(directory)
-        .filter(|there| *there != here.to_string())
-    {
-        Some(there) => anyhow::anyhow!("{here} is a copy of {there}, which is running: stop that run first"),
-        None => error.into(),
-    }
+    let here = run.path().display().to_string();
+    pids.iter().find_map(directory).filter(|there| *there != here)
 }
 
 /// What the launcher is doing.

@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use shoal_common::channel::Domain;
+use shoal_common::run_dir::RunDir;
 use support::output_of;
 use tempfile::TempDir;
 
@@ -290,6 +292,30 @@ fn an_interrupted_stage_leaves_nothing_behind() {
         assert_eq!(entries(temporary.path()), 0, "{stage}");
         assert_eq!(shared_files(&shared), 0, "{stage}");
     }
+}
+
+#[test]
+fn the_training_of_a_killed_stage_ends() {
+    let temporary = TempDir::new().unwrap();
+    let mut child = bench("run", temporary.path(), "60")
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let run = eventually("run", || {
+        let directory = std::fs::read_dir(temporary.path()).unwrap().next()?.unwrap();
+        let run = RunDir::open(&directory.path().join("run")).ok()?;
+        let begun = run.incarnations().exists() && run.is_running().unwrap();
+        begun.then_some(run)
+    });
+    let prefix = format!("shoal_{}_", run.config().unwrap().run.id);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    eventually("run", || (!run.is_running().unwrap()).then_some(()));
+    eventually("run", || {
+        Domain::remove_abandoned().unwrap();
+        (shared_files(&prefix) == 0).then_some(())
+    });
 }
 
 #[test]

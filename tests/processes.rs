@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use shoal_common::channel::Domain;
-use support::{Workplace, error_line, parse, until};
+use support::{QUICK, Workplace, contents, error_line, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
@@ -145,9 +145,8 @@ fn a_run_without_free_file_descriptors_continues_when_there_are_some_again() {
         ..getrlimit(Resource::Nofile)
     });
     running.kill("actor-0");
-    until("the actor cannot be started", || {
-        running.log().matches("cannot start actor 0").count() >= 2
-    });
+    let is_refused = |line: &&str| line.starts_with("actor-0 ") && line.contains("trying again in");
+    until("the actor cannot be started", || running.log().lines().filter(is_refused).count() >= 2);
     assert!(running.pids("actor-0").is_empty());
     limit(before);
     until("the actor is started again", || running.pids("actor-0").len() == 1);
@@ -254,6 +253,33 @@ fn a_run_whose_directory_is_removed_or_replaced_ends_with_one_line() {
             "nothing is written into another directory"
         );
     }
+}
+
+#[test]
+fn nothing_is_written_into_a_run_that_takes_the_place_of_one_in_its_final_evaluation() {
+    let place = Workplace::new();
+    // So many episodes that the evaluation takes seconds.
+    let long = ["--steps", "500", "--set", "evaluation.final_episodes=10000"];
+    let running = place.start_as("run", &[&QUICK[..8], &long].concat());
+    let run = running.run.clone();
+    let outcome = || std::fs::read_to_string(run.join("outcome.json")).unwrap_or_default();
+    until("the final evaluation has begun", || {
+        outcome().contains("final evaluation")
+    });
+    std::fs::rename(&run, place.path().join("kept")).unwrap();
+    place.copy("kept", "run");
+    let before = contents(&run);
+    let (code, printed) = running.wait_for_launcher();
+    let said = place.stderr();
+    assert_eq!((code, printed.as_str()), (Some(1), ""), "{said}");
+    let last = said.lines().last().unwrap();
+    assert!(last.contains("removed or renamed"), "{said}");
+    let after = contents(&run);
+    let changed: Vec<_> = after
+        .iter()
+        .filter(|(path, bytes)| before.get(*path) != Some(bytes))
+        .collect();
+    assert!(changed.is_empty() && before.len() == after.len(), "{:?}", after.keys());
 }
 
 #[test]

@@ -14,6 +14,7 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 use rustix::process::{Pid, Signal, kill_process};
+use shoal_common::run_dir::RunDir;
 use support::{Leftovers, Workplace, error_line, until};
 
 /// A running `shoal reproduce`; ended when dropped.
@@ -242,6 +243,41 @@ fn a_failed_seed_is_reported_missing_and_the_others_continue() {
         "{refused}"
     );
     assert!(place.path().join("kept/pendulum/seed-2.json").exists() && !results.exists());
+}
+
+/// A seed that trains for minutes.
+const LONG: [&str; 8] = ["reproduce", "pendulum", "--seeds", "1", "--jobs", "1", "--out", "kept"];
+
+#[test]
+fn a_seed_that_was_stopped_has_no_result() {
+    let place = Workplace::new();
+    let [first, _] = runs(&place);
+    let reproduction = Reproduction::start(&place, &LONG);
+    until("the seed trains", || starts(&first) == 1);
+    assert!(place.output(&["stop", first.to_str().unwrap()]).status.success());
+    assert_eq!(reproduction.wait().code(), Some(1), "{}", place.stderr());
+    let failed = "pendulum seed 1: failed: it was stopped before its end";
+    assert!(place.stderr().contains(failed), "{}", place.stderr());
+    assert!(!place.path().join("kept/pendulum.jsonl.gz").exists());
+}
+
+#[test]
+fn the_trainings_of_a_killed_reproduction_end_and_the_same_command_continues_them() {
+    let place = Workplace::new();
+    let [first, _] = runs(&place);
+    let reproduction = Reproduction::start(&place, &LONG);
+    until("the seed trains", || starts(&first) == 1);
+    reproduction.signal(Signal::KILL);
+    reproduction.wait();
+    until("its training has ended", || {
+        !RunDir::open(&first).unwrap().is_running().unwrap()
+    });
+    assert!(!first.join("checkpoints/last.policy").exists(), "{}", log(&first));
+    let reproduction = Reproduction::start(&place, &LONG);
+    until("it goes on", || starts(&first) == 2);
+    reproduction.signal(Signal::INT);
+    assert_eq!(reproduction.wait().code(), Some(130), "{}", place.stderr());
+    Leftovers::of(&first).wait_until_gone();
 }
 
 #[test]

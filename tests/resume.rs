@@ -4,16 +4,18 @@
 
 mod support;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use shoal_common::channel::Domain;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
-use support::{Running, Workplace, error_line, parse, until};
+use shoal_common::run_dir::RunDir;
+use support::{Running, Workplace, contents, error_line, parse, until};
 
 /// Rows in the ring of a quick run's replay.
 const RING: u64 = 2000;
@@ -111,19 +113,54 @@ fn resume_changes_nothing_before_the_last_role_of_a_killed_launcher_has_ended() 
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
-/// The files in a directory, at any depth, with their bytes.
-fn contents(directory: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(directory).unwrap().map(Result::unwrap) {
-        let path = entry.path();
-        if path.is_dir() {
-            found.append(&mut contents(&path));
-        } else {
-            let bytes = std::fs::read(&path).unwrap();
-            found.insert(path, bytes);
-        }
-    }
-    found
+#[test]
+fn a_run_is_not_removed_before_the_last_role_of_its_killed_launcher_has_ended() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    let run = running.run.clone();
+    wait_for_checkpoints(&running);
+    // For a role that does not end, as above.
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let role = Domain::join(&config.run.id, config.actors.max).unwrap();
+    running.kill_all();
+    let before = contents(&run);
+    let message = error_line(&place.output(&["rm", "--yes", "run"]));
+    let advice = format!("still alive and do not end (stopped?): kill -9 {}", std::process::id());
+    assert!(
+        message.contains("cannot remove ") && message.contains(&advice),
+        "{message}"
+    );
+    assert_eq!(contents(&run), before);
+    role.leave().unwrap();
+    assert!(place.output(&["rm", "--yes", "run"]).status.success());
+    assert!(!run.exists());
+}
+
+#[test]
+fn nothing_is_written_into_a_run_that_takes_the_place_of_one_that_is_resumed() {
+    let place = Workplace::new();
+    place.train(&["pendulum", "--steps", "500", "--run", "run"]);
+    place.copy("run", "other");
+    let [run, other, kept] = ["run", "other", "kept"].map(|name| place.path().join(name));
+    // So many episodes that the best policy is evaluated again for seconds.
+    let longer = ["--steps", "600", "--set", "evaluation.episodes=10000"];
+    let mut resumed = place.shoal(&[&["resume", "run"], &longer[..]].concat());
+    let resumed = resumed.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    until("the run is locked", || {
+        RunDir::open(&run).unwrap().is_running().unwrap()
+    });
+    let before = contents(&other);
+    std::fs::rename(&run, &kept).unwrap();
+    std::fs::rename(&other, &run).unwrap();
+    let output = resumed.wait_with_output().unwrap();
+    let said = error_line(&output);
+    assert!(said.contains("removed or renamed"), "{said}");
+    let after = contents(&run);
+    assert!(
+        before.len() == after.len() && before.values().eq(after.values()),
+        "{:?}",
+        after.keys()
+    );
 }
 
 #[test]

@@ -219,6 +219,37 @@ fn an_interrupted_or_killed_suite_continues_where_it_was() {
 }
 
 #[test]
+fn a_run_of_a_suite_that_was_stopped_is_not_done() {
+    let place = Workplace::new();
+    let suite = [
+        "train", "pendulum", "--run", "suite", "--seeds", "3,1", "--steps", "2000", "--jobs", "1",
+    ];
+    let mut command = place.shoal(&[&suite[..], &QUICK, &SLOW].concat());
+    let training = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let first = place.path().join("suite/seed=3");
+    until("the first run learns", || learned(&first) > 2);
+    assert!(place.output(&["stop", "suite/seed=3"]).status.success());
+    let output = training.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("seed=3: failed: it was stopped before its end") && !said.contains("seed=3: done"),
+        "{said}"
+    );
+    assert!(
+        said.contains("seed=1: done") && said.contains(", 1 of 2 runs"),
+        "{said}"
+    );
+    assert!(
+        said.contains("error: 1 of the runs failed; to continue with them: shoal resume "),
+        "{said}"
+    );
+    let output = place.output(&["resume", "suite", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(json(&output)["runs"][0]["env_steps"], 2_000);
+}
+
+#[test]
 fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
     let place = Workplace::new();
     let command = [

@@ -12,8 +12,8 @@ use shoal_common::config::Config;
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::numbers::mean_and_std;
-use shoal_common::policy::Policy;
-use shoal_common::policy_file::PolicyFile;
+use shoal_common::policy::{Policy, PolicyLayout};
+use shoal_common::policy_file::{PolicyFile, PolicyFileError};
 use shoal_common::report::{EvaluatedPeriod, EvaluationReport};
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
@@ -133,6 +133,17 @@ struct EvaluatedPolicy {
 }
 
 impl EvaluatedPolicy {
+    /// The one that a previous evaluator kept in this file. Earlier versions may have kept one that diverged.
+    fn kept(path: &Path, layout: &PolicyLayout) -> Result<Option<Self>, PolicyFileError> {
+        let kept = PolicyFile::read_if_any(path, layout)?.filter(|kept| kept.return_mean.is_finite());
+        Ok(kept.map(|kept| Self {
+            version: kept.version,
+            mean: kept.return_mean,
+            parameters: kept.parameters,
+            confirmed: None,
+        }))
+    }
+
     /// A restarted learner may give a version to another policy, so the parameters are compared too.
     fn is_same_policy(&self, other: &Self) -> bool {
         self.version == other.version && self.parameters == other.parameters
@@ -154,18 +165,7 @@ impl<'a> Evaluator<'a> {
             stop,
         )?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        let best = if settings.run.best_policy().exists() {
-            let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
-            // Earlier versions may have kept a policy that diverged.
-            best.return_mean.is_finite().then_some(EvaluatedPolicy {
-                version: best.version,
-                mean: best.return_mean,
-                parameters: best.parameters,
-                confirmed: None,
-            })
-        } else {
-            None
-        };
+        let best = EvaluatedPolicy::kept(&settings.run.best_policy(), &layout)?;
         heartbeat.beat(Activity::WaitingForPeer);
         let state = EvaluatorState::read(&settings.run.evaluator_state())?;
         let reports = Reporter::open(domain)?;
@@ -376,6 +376,8 @@ impl<'a> Evaluator<'a> {
 mod tests {
     use std::convert::Infallible;
 
+    use shoal_common::network::{Hidden, NetworkLayout};
+
     use super::*;
 
     /// A policy whose one parameter is its mean return on the episodes that confirm.
@@ -397,6 +399,18 @@ mod tests {
         };
         let Ok((best, replaced)) = better_of(best, candidate, confirm);
         (best.map(|best| best.version), replaced, asked)
+    }
+
+    #[test]
+    fn a_best_policy_that_cannot_be_inspected_is_an_error() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("best.policy");
+        let network = NetworkLayout::new(1, Hidden::relu([1, 1]), 1);
+        let layout = PolicyLayout::Deterministic(network);
+        assert!(Best::kept(&path, &layout).unwrap().is_none());
+        // To follow it fails, also for root.
+        std::os::unix::fs::symlink(&path, &path).unwrap();
+        assert!(Best::kept(&path, &layout).is_err());
     }
 
     #[test]

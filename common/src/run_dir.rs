@@ -309,12 +309,12 @@ impl RunDir {
     /// # Errors
     /// When it is missing or invalid.
     pub fn config(&self) -> Result<Config, ConfigError> {
-        let used = self.used_config_file();
-        if used.exists() {
-            Config::load(&used)
-        } else {
+        match Config::load(&self.used_config_file()) {
             // A run of an earlier version, or a run that has just been made.
-            Config::load(&self.config_file())
+            Err(ConfigError::Unreadable { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
+                Config::load(&self.config_file())
+            }
+            loaded => loaded,
         }
     }
 

@@ -110,7 +110,10 @@ def follow(command: Sequence[str], quiet: bool) -> str:
     """Runs a training to its end, shows its lines while it runs, and returns what it printed.
 
     If this Python is interrupted, the training is too: it saves what it has, and then ``KeyboardInterrupt`` is raised.
+    If it is killed, the training ends and can be resumed.
     """
+    # The system kills a tied program with the thread that started it, which waits here. The roles save and end then.
+    command = [program(), "tied", str(os.getpid()), *command]
     last: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
     with tempfile.TemporaryFile("w+", **TEXT) as printed:
         child = subprocess.Popen(
@@ -159,8 +162,9 @@ def train(
     may be numpy's. The other arguments are the options of ``shoal train``. ``run`` is the directory to create, by default
     ``runs/<what>-<n>``.
 
-    With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
-    returns as soon as all actors work. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
+    With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. If this Python is
+    killed meanwhile, the run ends too, and can be resumed. Without ``wait``, it returns as soon as all actors work. The
+    training then continues even if this Python ends; :meth:`Run.stop` ends it.
 
     Raises :class:`ShoalError` if the program refuses or fails.
     """

@@ -196,7 +196,7 @@ class Copy:
     def __init__(self, run: Run, to: str, project: str, group: str | None) -> None:
         self.run = run
         self._file = run.path / f"tracking-{to}.json"
-        state = json.loads(self._file.read_text(encoding="utf-8")) if self._file.exists() else {}
+        state = self._load()
         # The file is written again when a setting changes.
         self._begun: float = state.get("begun", (run.path / "config.toml").stat().st_mtime)
         self._lines: dict[str, int] = state.get("lines", {})
@@ -230,10 +230,23 @@ class Copy:
         running = is_locked(self.run.path)
         self._tracker.close("running" if running else "finished" if finished else "stopped")
 
+    def _load(self) -> dict[str, Any]:
+        try:
+            state = json.loads(self._file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            raise ShoalError(f"{self._file} is damaged; remove it to copy the run once more, as a new one") from error
+        return state
+
     def _save(self) -> None:
         state = {"id": self._tracker.id, "begun": self._begun, "lines": self._lines, "result": self._result}
         new = self._file.with_suffix(".json.new")
-        new.write_text(json.dumps({"format": 1, **state}))
+        with new.open("w", encoding="utf-8") as file:
+            json.dump({"format": 1, **state}, file)
+            file.flush()
+            # Before it is renamed: a power loss must not leave an empty file with the final name.
+            os.fsync(file.fileno())
         new.replace(self._file)
 
 

@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 import unittest
+import unittest.mock
 from pathlib import Path
 
 import shoal
@@ -105,6 +106,28 @@ class Track(unittest.TestCase):
         self.assertFalse(following.is_alive())
         self.assertEqual(sorted(Recorder.told), ["shoal/suite/a", "shoal/suite/b"])
         self.assertEqual([len(told["metrics"]) for told in Recorder.told.values()], [2, 2])
+
+    def test_a_power_loss_leaves_no_damaged_file_and_one_that_is_there_is_named(self) -> None:
+        run, done = self.make("run"), []
+        fsync, replace = os.fsync, Path.replace
+
+        def synced(number: int) -> None:
+            fsync(number)
+            done.append(("synced", os.fstat(number).st_size))
+
+        def renamed(path: Path, target: Path) -> Path:
+            done.append(("renamed", path.stat().st_size))
+            return replace(path, target)
+
+        with unittest.mock.patch("os.fsync", synced), unittest.mock.patch.object(Path, "replace", renamed):
+            track.track(run, "recorder")
+        self.assertTrue(done)
+        for before, after in zip(done[::2], done[1::2], strict=True):
+            self.assertEqual((before[0], after[0], before[1]), ("synced", "renamed", after[1]), done)
+        # Of an earlier version.
+        (run / "tracking-recorder.json").write_text("")
+        with self.assertRaisesRegex(shoal.ShoalError, "tracking-recorder.json is damaged; remove it"):
+            track.track(run, "recorder")
 
     def test_what_is_no_tracker_or_run_is_refused(self) -> None:
         for path, to, message in [("run", "tensorflow", "no tracker"), ("nothing", "recorder", "not a run directory")]:

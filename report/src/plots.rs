@@ -27,27 +27,39 @@ pub struct Drawn {
 }
 
 /// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. A program that serves
-/// the environment is started only if there is an `interrupt`, which ends its episode.
+/// the environment is started only if there is an `interrupt`, which ends its episode. `check` comes before each write:
+/// an episode may take long.
 ///
 /// # Errors
-/// When a file cannot be read or written, or the policy does not fit the run.
-pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interrupt>) -> anyhow::Result<Drawn> {
+/// When `check` fails, a file cannot be read or written, or the policy does not fit the run.
+pub fn draw(
+    run: &RunDir,
+    config: &Config,
+    out: &Path,
+    interrupt: Option<&Interrupt>,
+    check: impl Fn() -> anyhow::Result<()>,
+) -> anyhow::Result<Drawn> {
     let mut drawn = Drawn {
         files: vec![out.join("learning-curve.svg")],
         no_episode: None,
     };
     let evaluations = read_evaluations(&run.evaluations())?;
+    check()?;
     figure::learning_curve((&run.name(), config.algorithm.name()), &evaluations, &drawn.files[0])?;
     if !run.best_policy().exists() {
         return Ok(drawn);
     }
     if !config.environment.is_external() {
+        check()?;
         drawn.files.extend(behaviour(run, config, out)?);
     } else if let Some(interrupt) = interrupt
         && let Some(description) = description::kept(run, config)?
     {
         match episode_of_server(run, config, interrupt) {
-            Ok(trajectory) => drawn.files.push(episode(&description, &trajectory, out)?),
+            Ok(trajectory) => {
+                check()?;
+                drawn.files.push(episode(&description, &trajectory, out)?);
+            }
             Err(error) => drawn.no_episode = Some(one_line(error)),
         }
     }
@@ -115,7 +127,7 @@ mod tests {
         if let Some(said) = said {
             said.store(&run_dir.description()).unwrap();
         }
-        let no_episode = draw(&run_dir, &config, &out, Some(&Interrupt::default()))
+        let no_episode = draw(&run_dir, &config, &out, Some(&Interrupt::default()), || Ok(()))
             .unwrap()
             .no_episode;
         let entries = std::fs::read_dir(out).unwrap();

@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map;
 use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -245,12 +245,13 @@ fn line(result: &str, stage: &Stage) -> anyhow::Result<(Key, String)> {
 /// The numbers N of all entries `seed-N<ending>` in a directory, in ascending order; none if the directory does not
 /// exist.
 pub(super) fn numbered(directory: &Path, ending: &str) -> anyhow::Result<Vec<u64>> {
-    if !directory.exists() {
-        return Ok(Vec::new());
-    }
     let reading = || format!("cannot read {}", directory.display());
+    let entries = match std::fs::read_dir(directory) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries.with_context(reading)?,
+    };
     let mut numbers = Vec::new();
-    for entry in std::fs::read_dir(directory).with_context(reading)? {
+    for entry in entries {
         let name = entry.with_context(reading)?.file_name();
         let number = name
             .to_str()

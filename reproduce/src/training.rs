@@ -1,10 +1,10 @@
 //! One training: starts this program as `shoal train` or `shoal resume`.
 
-use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::Command;
 
 use shoal_common::run_dir::{RunDir, RunDirError};
+use shoal_run::child_process::tied;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::interrupted_start::remove_interrupted_start;
 pub(super) use shoal_run::jobs::TrainingEnd;
@@ -57,7 +57,6 @@ pub(super) fn train(
     interrupted: Interrupted<'_>,
 ) -> anyhow::Result<TrainingEnd> {
     let mut command = Command::new("/proc/self/exe");
-    command.arg0("shoal");
     match SeedProgress::of(run)? {
         SeedProgress::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
         SeedProgress::Absent => {
@@ -76,16 +75,21 @@ pub(super) fn train(
         }
     }
     command.args(length.arguments()).arg("--quiet");
-    run_training(&mut command, interrupted)
+    let has_finished = || match SeedProgress::of(run)? {
+        SeedProgress::Started(progress) => has_ended(run, length, progress),
+        SeedProgress::Absent => Ok(false),
+    };
+    // Tied to this process: if that is killed, the run ends, and the same command continues it.
+    run_training(&mut tied(&command)?, interrupted, has_finished)
 }
 
 /// Whether a run has reached this length and ended normally there, which leaves its last policy.
 fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<bool> {
     let run = RunDir::open(run)?;
-    if !run.last_policy().exists() {
+    let Some(last) = SavedPolicy::Last.read_if_any(&run, &run.config()?)? else {
         return Ok(false);
-    }
-    let steps = SavedPolicy::Last.read(&run, &run.config()?)?.env_steps;
+    };
+    let steps = last.env_steps;
     Ok(match length {
         Length::Steps(wanted) => steps >= wanted,
         Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps,

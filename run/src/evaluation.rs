@@ -7,6 +7,8 @@ pub mod final_evaluation;
 pub mod frames;
 pub mod rollout;
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 use shoal_common::config::Config;
 use shoal_common::numbers::mean_and_std;
@@ -32,11 +34,22 @@ pub enum SavedPolicy {
 impl SavedPolicy {
     /// Reads this policy of a run. It must fit the run's network.
     pub fn read(self, run: &RunDir, config: &Config) -> anyhow::Result<PolicyFile> {
-        let path = match self {
+        Ok(PolicyFile::read(&self.path(run), &policy_layout(config)?)?)
+    }
+
+    /// As [`SavedPolicy::read`]; `None` if the run has no such policy.
+    ///
+    /// # Errors
+    /// When it is unknown whether there is one, or it cannot be used.
+    pub fn read_if_any(self, run: &RunDir, config: &Config) -> anyhow::Result<Option<PolicyFile>> {
+        Ok(PolicyFile::read_if_any(&self.path(run), &policy_layout(config)?)?)
+    }
+
+    fn path(self, run: &RunDir) -> PathBuf {
+        match self {
             Self::Best => run.best_policy(),
             Self::Last => run.last_policy(),
-        };
-        Ok(PolicyFile::read(&path, &policy_layout(config)?)?)
+        }
     }
 }
 

@@ -5,6 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 use shoal_common::run_dir::RunDir;
 
+use crate::files::is_there;
 use crate::origin::Origin;
 
 /// The names, or beginnings of names, of the files that exist before `config.toml`.
@@ -18,7 +19,7 @@ const FIRST_FILES: [&str; 3] = ["server.json", "description.json", "config.toml.
 pub fn remove_interrupted_start(path: &Path) -> anyhow::Result<bool> {
     // A start that was killed at once leaves an empty directory.
     let _ = std::fs::remove_dir(path);
-    if !path.exists() {
+    if !is_there(path)? {
         return Ok(true);
     }
     let run = RunDir::at(path);
@@ -33,10 +34,10 @@ pub fn remove_interrupted_start(path: &Path) -> anyhow::Result<bool> {
 }
 
 fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
-    if run.incarnations().exists() {
+    if is_there(&run.incarnations())? {
         return Ok(false);
     }
-    if run.config_file().exists() {
+    if is_there(&run.config_file())? {
         // `origin.json` is written after the networks and rows that the run begins with.
         return Ok(run.config()?.run.has_origin() && Origin::read(run)?.is_none());
     }
@@ -77,6 +78,10 @@ mod tests {
         assert!(with(&["server.json", "description.json", "config.toml.new"]) && !path.exists());
         assert!(!with(&["server.json", "notes"]) && path.join("notes").exists());
         assert!(!with(&["config.toml.new", "incarnations"]));
+        // A file that cannot be inspected, also not by root.
+        std::fs::remove_file(path.join("incarnations")).unwrap();
+        std::os::unix::fs::symlink(path.join("incarnations"), path.join("incarnations")).unwrap();
+        assert!(remove_interrupted_start(&path).is_err() && path.join("config.toml.new").exists());
 
         let mut config = resolve_preset("pendulum").unwrap();
         let _ = std::fs::remove_dir_all(&path);

@@ -67,11 +67,16 @@ pub fn run_jobs<Job: Send, Event: Send>(
     });
 }
 
-/// Runs a training to its end. A signal that `interrupted` returns is passed on to it.
+/// Runs a training to its end. A signal that `interrupted` returns is passed on to it. `has_finished` is asked when it
+/// has ended without an error: a run that `shoal stop` has ended has not.
 ///
 /// # Errors
-/// When it cannot be started, or fails: its last line.
-pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>) -> anyhow::Result<TrainingEnd> {
+/// When it cannot be started, was stopped, or fails: its last line.
+pub fn run_training(
+    command: &mut Command,
+    interrupted: &dyn Fn() -> Option<i32>,
+    has_finished: impl FnOnce() -> anyhow::Result<bool>,
+) -> anyhow::Result<TrainingEnd> {
     let mut training = ChildProcess::start(command, "training".into()).context("cannot start a training")?;
     let mut terminated = false;
     let status = loop {
@@ -99,6 +104,9 @@ pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>
                 .unwrap_or_else(|| format!("a training ended with {status}"))
         );
     }
+    if !has_finished()? {
+        bail!("it was stopped before its end");
+    }
     Ok(TrainingEnd::Finished)
 }
 
@@ -107,7 +115,15 @@ mod tests {
     use super::*;
 
     fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<TrainingEnd> {
-        run_training(Command::new("sh").args(["-c", script]), &|| signal)
+        run_training(Command::new("sh").args(["-c", script]), &|| signal, || Ok(true))
+    }
+
+    #[test]
+    fn a_training_that_was_stopped_has_not_finished() {
+        let stopped = run_training(&mut Command::new("true"), &|| None, || Ok(false));
+        assert_eq!(stopped.unwrap_err().to_string(), "it was stopped before its end");
+        let interrupted = run_training(&mut Command::new("true"), &|| Some(15), || Ok(false));
+        assert_eq!(interrupted.unwrap(), TrainingEnd::Interrupted);
     }
 
     #[test]

@@ -7,6 +7,7 @@ pub(crate) mod demonstrations;
 pub mod description;
 pub mod evaluation;
 pub mod external_environment;
+pub mod files;
 pub mod interrupted_start;
 pub mod jobs;
 pub mod joining;

@@ -25,13 +25,10 @@ fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf
     use anyhow::Context;
     use shoal_remote::files::KeyFile;
     use shoal_remote::keys::{self, VALID};
+    use shoal_run::files::is_there;
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
-    let exists = |key: &PathBuf| {
-        key.try_exists()
-            .with_context(|| format!("cannot inspect {}", key.display()))
-    };
-    if new || !(exists(&gate)? && exists(&join)?) {
+    if new || !(is_there(&gate)? && is_there(&join)?) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
         // If this process is killed in between, one of two keys that do not match must not be left.
         match std::fs::remove_file(&join) {

@@ -25,7 +25,7 @@ pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let out = args.out.as_deref().unwrap_or(run.path());
     std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let mut stdout = std::io::stdout().lock();
-    let drawn = plots::draw(&run, &config, out, Some(&Interrupt::default()))?;
+    let drawn = plots::draw(&run, &config, out, Some(&Interrupt::default()), || Ok(()))?;
     for figure in drawn.files {
         writeln!(stdout, "{}", figure.display())?;
     }

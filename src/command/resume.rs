@@ -8,10 +8,11 @@ use anyhow::{Context, bail};
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_common::message::say;
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::external_environment::server_location::ServerLocation;
+use shoal_run::files::is_there;
 use shoal_run::numbers::parse_count;
 use shoal_run::origin::Origin;
 use shoal_run::plan::{RequestedChanges, Revision, warning};
@@ -90,7 +91,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     let used = run.config()?;
     launcher::wait_for_predecessors(&used.run.id, &run)?;
     let here = args.run.display();
-    if run.replay_removed().exists() && !run.replay_file().exists() {
+    if is_there(&run.replay_removed())? && !is_there(&run.replay_file())? {
         bail!(
             "cannot resume {here}: `shoal rm --replay` has removed its replay, from which it would learn; eval, report, \
              plot and film still work, and `shoal train … --from {here}` begins a new run with its networks"
@@ -128,6 +129,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     // A learner that was killed has reported more steps than it has saved.
     let mut now = Moment::of_records(&run)?;
     now.env_steps = now.env_steps.max(steps_taken);
+    run.check()?;
     for change in revision.apply(&run, now)? {
         let ChangeRecord {
             key,
@@ -170,7 +172,7 @@ fn resume_suite(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated
 /// with another number of episodes. Returns the signal that ended it, if one did.
-fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<Option<i32>> {
+fn reevaluate_best_policy(run: &LockedRun, revision: &Revision) -> anyhow::Result<Option<i32>> {
     let signals = Signals::register()?;
     let interrupt = signals.interrupt();
     let here = run.path().display();

@@ -95,9 +95,13 @@ fn prepare_removal(run: RunDir, replay: bool) -> anyhow::Result<Removal> {
         other => other.into(),
     })?;
     // A file `config.toml` alone does not prove that this is a run.
-    if let Err(error) = run.config() {
-        bail!("{here} may not be a run, and is left as it is: {error}; to remove it nevertheless: rm -r {here}");
-    }
+    let config = run.config().map_err(|error| {
+        anyhow::anyhow!(
+            "{here} may not be a run, and is left as it is: {error}; to remove it nevertheless: rm -r {here}"
+        )
+    })?;
+    // Before anything is removed: the roles of a launcher that was killed would save into the next run at this path.
+    launcher::wait_for_roles_here(&config.run.id, &run).with_context(|| format!("cannot remove {here}"))?;
     let bytes = if replay {
         match std::fs::metadata(run.replay_file()) {
             Ok(file) => file.len(),

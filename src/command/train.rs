@@ -6,6 +6,7 @@ use anyhow::Context;
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_common::message::say;
+use shoal_common::run_dir::RunDir;
 use shoal_run::plan::{Plan, RunOverrides, preset_patterns};
 use shoal_run::suite;
 use shoal_run::usage::UsageError;
@@ -104,17 +105,41 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         let run = run.unlock();
         let begun = detach::resume_run(run.path(), &args.listen.arguments(), &args.output);
         if let Ok(_lock) = run.lock()
-            && !run.incarnations().exists()
+            && was_never_started(&run)
         {
             let _ = run.remove();
         }
         return begun;
     }
     run_training(config, &run, &args.output, &args.listen).inspect_err(|_| {
-        // If no process was started, the directory is removed, so that its name is free again. The check ensures that
-        // the path still leads to it.
-        if run.check().is_ok() && !run.incarnations().exists() {
+        // If no process was started, the directory is removed, so that its name is free again. By now the path may
+        // belong to somebody else.
+        if run.check().is_ok() && was_never_started(&run) {
             let _ = run.remove();
         }
     })
+}
+
+/// Whether it is certain that no process of the run was ever started. A directory that cannot be inspected for the
+/// moment may be that of a trained run.
+fn was_never_started(run: &RunDir) -> bool {
+    matches!(run.incarnations().try_exists(), Ok(false))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_that_cannot_be_inspected_may_have_been_started() {
+        let parent = tempfile::tempdir().unwrap();
+        let run = RunDir::at(parent.path());
+        assert!(was_never_started(&run));
+        // To follow it fails, also for root.
+        std::os::unix::fs::symlink(run.incarnations(), run.incarnations()).unwrap();
+        assert!(!was_never_started(&run));
+        std::fs::remove_file(run.incarnations()).unwrap();
+        std::fs::write(run.incarnations(), "").unwrap();
+        assert!(!was_never_started(&run));
+    }
 }

@@ -95,6 +95,7 @@ fn train_and_report(
     let mut finished = RunOutcome::new(RunState::Finished, env_steps, episodes);
     if outcome.ending == RunEnd::Finished {
         let interrupt = signals.interrupt();
+        run.check()?;
         let under_way = RunOutcome::new(RunState::Running, env_steps, episodes);
         under_way.with_reason(OutcomeReason::FinalEvaluation).write(run)?;
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
@@ -124,7 +125,8 @@ fn train_and_report(
     let interrupt = signals.interrupt();
     // A run that was stopped should end soon, so no environment is started for a figure.
     let may_start = !evaluated.is_empty() && interrupt.signal().is_none();
-    match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt)) {
+    let is_here = || Ok(run.check()?);
+    match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt), is_here) {
         Ok(drawn) => {
             if let Some(why) = drawn.no_episode.filter(|_| interrupt.signal().is_none()) {
                 say(format!("no episode was drawn: {why}"));
@@ -136,6 +138,7 @@ fn train_and_report(
         }
     }
     if outcome.ending == RunEnd::Finished {
+        run.check()?;
         finished.write(run)?;
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|first| &first.summary))?;
@@ -159,7 +162,7 @@ fn train_and_report(
 /// As [`best_policy::evaluate_and_keep_best`], with a bar for the progress.
 fn final_evaluation(
     config: &Config,
-    run: &RunDir,
+    run: &LockedRun,
     env_steps: u64,
     interrupt: &Interrupt,
     quiet: bool,

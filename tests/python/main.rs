@@ -9,9 +9,11 @@ mod support;
 
 use std::collections::BTreeMap;
 use std::process::{Command, ExitCode};
+use std::time::{Duration, Instant};
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use rustix::process::Signal;
 use shoal_common::policy::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::Space;
@@ -32,6 +34,7 @@ fn main() -> ExitCode {
     suite::run(vec![
         test!(numpy_policies_act_as_those_of_the_program, PYTHON),
         test!(runs_are_started_read_changed_and_stopped_from_python, PYTHON),
+        test!(a_training_ends_with_the_python_that_waits_for_it, PYTHON),
         test!(suites_are_trained_and_read_from_python, PYTHON),
         test!(the_tutorials_python_works, PYTHON),
         test!(the_notebook_works, PYTHON, MATPLOTLIB),
@@ -130,6 +133,36 @@ fn numpy_policies_act_as_those_of_the_program() {
 
 fn runs_are_started_read_changed_and_stopped_from_python() {
     python(&Workplace::new(), &[&script("every_day.py")]);
+}
+
+fn a_training_ends_with_the_python_that_waits_for_it() {
+    let place = Workplace::new();
+    let code = "import shoal; shoal.train('pendulum', run='run', steps=100_000_000, set={'ddpg.hidden': [16, 16]})";
+    let mut python = Command::new("python3");
+    python
+        .args(["-c", code])
+        .env("SHOAL", env!("CARGO_BIN_EXE_shoal"))
+        .current_dir(place.path());
+    let running = place.launch_command("run", &mut python);
+    let run = RunDir::open(&running.run).unwrap();
+    running.wait_for_learning();
+    let leftovers = running.leftovers();
+    running.signal(Signal::KILL);
+    running.wait_for_launcher();
+    let begun = Instant::now();
+    while run.is_running().unwrap() && begun.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    if run.is_running().unwrap() {
+        // So that this test leaves nothing.
+        place.output(&["stop", "run"]);
+        panic!("the run goes on without Python");
+    }
+    until("its roles have ended", || leftovers.processes().is_empty());
+    let resumed = place.resume("run", &[]);
+    resumed.wait_for_learning();
+    assert!(place.output(&["stop", "run"]).status.success());
+    assert_eq!(resumed.wait().0, Some(0));
 }
 
 fn suites_are_trained_and_read_from_python() {

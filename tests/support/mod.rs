@@ -2,7 +2,7 @@
 
 #![allow(dead_code, reason = "every suite uses a different part of this file")]
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -354,6 +354,21 @@ impl Drop for Workplace {
     fn drop(&mut self) {
         let _ = Domain::remove_abandoned();
     }
+}
+
+/// The files in a directory, at any depth, with their bytes.
+pub(crate) fn contents(directory: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(directory).unwrap().map(Result::unwrap) {
+        let path = entry.path();
+        if path.is_dir() {
+            found.append(&mut contents(&path));
+        } else {
+            let bytes = std::fs::read(&path).unwrap();
+            found.insert(path, bytes);
+        }
+    }
+    found
 }
 
 /// Processes and shared memory of a run.

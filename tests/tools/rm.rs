@@ -30,6 +30,11 @@ fn runs_are_removed_after_a_question_and_a_running_one_is_not() {
     let message = error_line(&place.output(&["rm", "--yes", "runs/three", "runs/running"]));
     assert!(message.contains("runs/running is running: end it first"), "{message}");
     assert!(exists("runs/three"), "nothing is removed if one of them cannot be");
+    // A copy has no roles of its own.
+    place.copy("runs/running", "runs/copy");
+    let removed = place.output(&["rm", "--yes", "runs/copy"]);
+    assert!(removed.status.success(), "{}", String::from_utf8_lossy(&removed.stderr));
+    assert!(!exists("runs/copy"));
     running.wait_for_learning();
     assert!(place.output(&["stop", "runs/running"]).status.success());
     running.wait_for_launcher();

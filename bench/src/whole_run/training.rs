@@ -1,7 +1,6 @@
 //! A training run as a child process, and the times of its events. It is polled every millisecond.
 
 use std::collections::HashSet;
-use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -14,7 +13,7 @@ use shoal_common::commit::CommitReader;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
-use shoal_run::child_process::ChildProcess;
+use shoal_run::child_process::{ChildProcess, tied};
 use shoal_run::client::RunClient;
 use tempfile::TempDir;
 
@@ -74,11 +73,11 @@ impl Training {
             .tempdir()
             .context("cannot make a temporary directory")?;
         let mut command = Command::new("/proc/self/exe");
-        command
-            .arg0("shoal")
-            .args(["train", "pendulum", "--quiet", "--seed", "1"]);
+        command.args(["train", "pendulum", "--quiet", "--seed", "1"]);
         command.args(["--set", "run.steps=1_000_000_000_000", "--run"]);
         command.arg(directory.path().join("run"));
+        // Tied to this process: if that is killed, the training, which has no end, ends.
+        let mut command = tied(&command).context("cannot start a training")?;
         let started_at = Instant::now();
         let launcher = ChildProcess::start(&mut command, "training".into()).context("cannot start a training")?;
         Ok(Self {

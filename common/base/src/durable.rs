@@ -107,6 +107,13 @@ fn open_temporary(path: &Path) -> io::Result<(PathBuf, File)> {
     Ok((temporary, file))
 }
 
+/// Bytes of disk that the file at `path` occupies; 0 if there is none.
+pub fn allocated_bytes(path: &Path) -> u64 {
+    /// In which the system counts, whatever the file system's own blocks are.
+    const BLOCK: u64 = 512;
+    fs::metadata(path).map_or(0, |file| file.blocks() * BLOCK)
+}
+
 /// Writes a file atomically: at any moment `path` is either the old file or the complete new one, even after a power
 /// loss.
 pub fn write_atomically<E: From<io::Error>>(

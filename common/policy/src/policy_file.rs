@@ -100,6 +100,14 @@ impl PolicyFile {
         Ok(policy)
     }
 
+    /// As [`PolicyFile::read`]; `None` if there is no such file. One that cannot be inspected is an error.
+    pub fn read_if_any(path: &Path, layout: &PolicyLayout) -> Result<Option<Self>, PolicyFileError> {
+        match Self::read(path, layout) {
+            Err(PolicyFileError::Missing(_)) => Ok(None),
+            read => read.map(Some),
+        }
+    }
+
     /// The words before the parameters, in the order of the file.
     fn head(&self) -> [u64; HEAD_WORDS] {
         [
@@ -166,7 +174,14 @@ mod tests {
             PolicyFile::read(&path, &layout()),
             Err(PolicyFileError::Missing(_))
         ));
+        assert_eq!(PolicyFile::read_if_any(&path, &layout()).unwrap(), None);
+        std::os::unix::fs::symlink(&path, &path).unwrap();
+        assert!(
+            PolicyFile::read_if_any(&path, &layout()).is_err(),
+            "a path that cannot be followed is no missing file"
+        );
         policy().write(&path).unwrap();
+        assert_eq!(PolicyFile::read_if_any(&path, &layout()).unwrap(), Some(policy()));
         assert_eq!(PolicyFile::read(&path, &layout()).unwrap(), policy());
         let better = PolicyFile {
             version: 9,

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use bincode::config::{self, Config};
 use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
+use shoal_common::durable::{self, FileKind, PreparedFile, SealError, allocated_bytes, sync_directory_of};
 use shoal_common::numbers::COUNTER_LIMIT;
 
 use crate::algorithms::registry;
@@ -157,6 +157,13 @@ impl Checkpoints {
             latest_is_sound: None,
             hook: |_| (),
         }
+    }
+
+    /// Bytes of disk that the checkpoints in `directory` occupy, with one that a killed learner has left unfinished. The
+    /// next ones take their place.
+    pub(crate) fn allocated_bytes(directory: &Path) -> u64 {
+        let names = [LATEST, PREVIOUS, "latest.ckpt.new"];
+        names.map(|name| allocated_bytes(&directory.join(name))).iter().sum()
     }
 
     /// Calls `hook` after each step of every later `save`, for crash tests.

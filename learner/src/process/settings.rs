@@ -4,12 +4,13 @@ use std::path::PathBuf;
 
 use shoal_common::channel::ChannelError;
 use shoal_common::config::{Config, Mode};
+use shoal_common::durable::allocated_bytes;
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
 use shoal_common::role::RoleInstance;
 use shoal_common::run_dir::RunDir;
 
-use super::checkpoint::CheckpointError;
+use super::checkpoint::{CheckpointError, Checkpoints};
 use super::intake::IntakeError;
 use crate::algorithms::algorithm::StateArrayError;
 use crate::algorithms::registry;
@@ -89,26 +90,29 @@ pub enum SizeError {
     },
 }
 
-/// Bytes that the learner's files need on the disk, for a run in the directory `run`. Not counted are a replay that
-/// exists already, and space that a killed start has reserved for one.
+/// Bytes that the learner's files and the best policy need on the disk beyond those that the run in the directory `run`
+/// has already. A replay that exists is not counted, nor what a start that was killed has reserved for one.
 ///
 /// # Errors
 /// When the files would be too large.
 pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     let capacity = config.replay.capacity;
-    let replay = if run.replay_file().exists() {
-        0
-    } else {
+    let replay = if matches!(run.replay_file().try_exists(), Ok(false)) {
         let offsets = replay_layout(config).offsets().ok_or(SizeError::Replay { capacity })?;
         (offsets.end as u64).saturating_sub(unfinished_bytes(&run.replay_file()))
+    } else {
+        0
     };
     let (_, policy) = config.learned().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,
     // the last, and one while it is written.
     let numbers = 3 * (registry::state_numbers(config) + policy.parameters()) as u64;
+    let there = Checkpoints::allocated_bytes(&run.checkpoints())
+        + allocated_bytes(&run.best_policy())
+        + allocated_bytes(&run.last_policy());
     let sum = numbers
         .checked_mul(size_of::<f32>() as u64)
-        .and_then(|bytes| bytes.checked_add(replay));
+        .and_then(|bytes| bytes.saturating_sub(there).checked_add(replay));
     sum.ok_or(SizeError::Sum { capacity })
 }
 

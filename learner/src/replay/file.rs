@@ -2,7 +2,7 @@
 
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use rustix::fs::{CWD, FallocateFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 use shoal_common::commit::{CommitRecord, FileOffsets, ReplayLayout, SYNCED, Words, WritableWords};
-use shoal_common::durable::sync_directory_of;
+use shoal_common::durable::{allocated_bytes, sync_directory_of};
 use shoal_common::file_lock;
 
 use super::error::ReplayError;
@@ -67,9 +67,7 @@ fn temporary(path: &Path) -> PathBuf {
 
 /// Bytes of disk that a killed [`create`] has reserved for the file at `path`. The next one frees them first.
 pub(crate) fn unfinished_bytes(path: &Path) -> u64 {
-    /// In which the system counts, whatever the file system's own blocks are.
-    const BLOCK: u64 = 512;
-    fs::metadata(temporary(path)).map_or(0, |file| file.blocks() * BLOCK)
+    allocated_bytes(&temporary(path))
 }
 
 /// Opens the file and compares it with the layout before anything is mapped for writing.

@@ -4,7 +4,7 @@
 use anyhow::Context;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::{LockedRun, RunDir};
 
 use crate::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
@@ -31,33 +31,29 @@ struct Candidate {
 /// evaluated. Calls `progress` with the policy and its finished episodes.
 ///
 /// # Errors
-/// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, or a signal has
-/// arrived.
+/// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, a signal has arrived,
+/// or the run is no longer at its place.
 pub fn evaluate_and_keep_best(
     config: &Config,
-    run: &RunDir,
+    run: &LockedRun,
     env_steps: u64,
     interrupt: &Interrupt,
     mut progress: impl FnMut(SavedPolicy, u32),
 ) -> anyhow::Result<Vec<FinalResult>> {
     let (episodes, seed) = (config.evaluation.final_episodes, config.run.seed);
     let mut candidates = Vec::new();
-    for (policy, path) in [
-        (SavedPolicy::Best, run.best_policy()),
-        (SavedPolicy::Last, run.last_policy()),
-    ] {
-        if path.exists() {
-            let file = policy.read(run, config)?;
-            if !is_finite(&file) {
-                continue;
-            }
-            progress(policy, 0);
-            let progress = |finished: u32| progress(policy, finished);
-            let summary = evaluate_policy(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
-            candidates.push(Candidate { policy, file, summary });
-        }
+    for policy in [SavedPolicy::Best, SavedPolicy::Last] {
+        let Some(file) = policy.read_if_any(run, config)?.filter(is_finite) else {
+            continue;
+        };
+        progress(policy, 0);
+        let progress = |finished: u32| progress(policy, finished);
+        let summary = evaluate_policy(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
+        candidates.push(Candidate { policy, file, summary });
     }
     let kept = better(&candidates).context("no policy has a finite return")?;
+    // The episodes may have taken long: by now another run may be at its place.
+    run.check()?;
     if kept.policy == SavedPolicy::Last {
         let best = PolicyFile {
             return_mean: kept.summary.return_mean,
@@ -100,12 +96,12 @@ fn better(candidates: &[Candidate]) -> Option<&Candidate> {
 /// # Errors
 /// When a policy cannot be read or written.
 pub fn ensure_best_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
-    let kept = run.best_policy().exists() && SavedPolicy::Best.read(run, config)?.return_mean.is_finite();
-    if !kept && run.last_policy().exists() {
-        let last = SavedPolicy::Last.read(run, config)?;
-        if is_finite(&last) {
-            last.write(&run.best_policy())?;
-        }
+    let best = SavedPolicy::Best.read_if_any(run, config)?;
+    if best.is_some_and(|best| best.return_mean.is_finite()) {
+        return Ok(());
+    }
+    if let Some(last) = SavedPolicy::Last.read_if_any(run, config)?.filter(is_finite) {
+        last.write(&run.best_policy())?;
     }
     Ok(())
 }
@@ -116,7 +112,63 @@ fn is_finite(file: &PolicyFile) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
+    use crate::evaluation::rollout::policy_layout;
+    use crate::testing::small;
+
+    /// A run at this path with its last policy, and its configuration.
+    fn run_with_last_policy(path: &Path) -> (Config, LockedRun) {
+        let (mut config, parameters) = small("name = \"pendulum\"");
+        config.evaluation.final_episodes = 2;
+        let run = RunDir::create(path).unwrap();
+        run.write_config(&config).unwrap();
+        std::fs::create_dir(run.checkpoints()).unwrap();
+        let last = PolicyFile {
+            fingerprint: policy_layout(&config).unwrap().fingerprint(),
+            version: 1,
+            env_steps: 1,
+            return_mean: f64::NAN,
+            return_std: 0.0,
+            episodes: 0,
+            parameters,
+        };
+        last.write(&run.last_policy()).unwrap();
+        (config, run.lock().unwrap())
+    }
+
+    #[test]
+    fn a_best_policy_that_cannot_be_inspected_is_not_replaced() {
+        let parent = tempfile::tempdir().unwrap();
+        let (config, run) = run_with_last_policy(&parent.path().join("run"));
+        // To follow it fails, also for root.
+        std::os::unix::fs::symlink(run.best_policy(), run.best_policy()).unwrap();
+        let kept = evaluate_and_keep_best(&config, &run, 1, &Interrupt::default(), |_, _| ());
+        for error in [kept.unwrap_err(), ensure_best_policy(&config, &run).unwrap_err()] {
+            assert!(error.to_string().contains("best.policy"), "{error}");
+        }
+        assert!(std::fs::symlink_metadata(run.best_policy()).unwrap().is_symlink());
+        std::fs::remove_file(run.best_policy()).unwrap();
+        ensure_best_policy(&config, &run).unwrap();
+        assert!(run.best_policy().exists());
+    }
+
+    #[test]
+    fn nothing_is_written_into_a_run_that_took_the_place_of_this_one_meanwhile() {
+        let parent = tempfile::tempdir().unwrap();
+        let path = parent.path().join("run");
+        let (config, run) = run_with_last_policy(&path);
+        let replace = |_, finished| {
+            if finished == 2 {
+                std::fs::rename(&path, parent.path().join("kept")).unwrap();
+                run_with_last_policy(&path);
+            }
+        };
+        let error = evaluate_and_keep_best(&config, &run, 1, &Interrupt::default(), replace).unwrap_err();
+        assert!(error.to_string().contains("removed or renamed"), "{error}");
+        assert!(!run.best_policy().exists() && !run.final_evaluation().exists());
+    }
 
     #[test]
     fn the_last_policy_is_kept_only_if_it_is_better() {

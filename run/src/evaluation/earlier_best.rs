@@ -2,11 +2,12 @@
 
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::LockedRun;
 
 use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
 use crate::external_environment::GYMNASIUM;
 use crate::external_environment::server_location::ServerLocation;
+use crate::files::is_there;
 use crate::signals::Interrupt;
 
 /// The best policy's result before and after it was evaluated again.
@@ -26,17 +27,19 @@ pub struct ReevaluatedPolicy {
 /// so the next call finds nothing to do.
 ///
 /// # Errors
-/// When the policy cannot be read or written, the environment fails, or a signal has arrived.
+/// When the policy cannot be read or written, the environment fails, a signal has arrived, or the run is no longer at
+/// its place.
 pub fn reevaluate_if_needed(
-    run: &RunDir,
+    run: &LockedRun,
     config: &Config,
     interrupt: &Interrupt,
 ) -> anyhow::Result<Option<ReevaluatedPolicy>> {
-    if !config.environment.name.starts_with(GYMNASIUM) || run.server_file().exists() {
+    if !config.environment.name.starts_with(GYMNASIUM) || is_there(&run.server_file())? {
         return Ok(None);
     }
     let evaluated = reevaluate_best(run, config, interrupt)?;
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
+        run.check()?;
         location.write(run)?;
     }
     Ok(evaluated)
@@ -45,16 +48,16 @@ pub fn reevaluate_if_needed(
 /// Evaluates the best policy with the episodes that later policies will have; `None` if there is none yet.
 ///
 /// # Errors
-/// When the policy cannot be read or written, the environment fails, or a signal has arrived.
+/// When the policy cannot be read or written, the environment fails, a signal has arrived, or the run is no longer at
+/// its place.
 pub fn reevaluate_best(
-    run: &RunDir,
+    run: &LockedRun,
     config: &Config,
     interrupt: &Interrupt,
 ) -> anyhow::Result<Option<ReevaluatedPolicy>> {
-    if !run.best_policy().exists() {
+    let Some(best) = SavedPolicy::Best.read_if_any(run, config)? else {
         return Ok(None);
-    }
-    let best = SavedPolicy::Best.read(run, config)?;
+    };
     let amount = (config.evaluation.episodes, config.run.seed);
     let now = evaluate_policy(run, config, &best.parameters, amount, interrupt, |_| ())?;
     let updated = PolicyFile {
@@ -63,6 +66,8 @@ pub fn reevaluate_best(
         episodes: now.episodes.into(),
         ..best.clone()
     };
+    // The episodes may have taken long: by now another run may be at its place.
+    run.check()?;
     updated.write(&run.best_policy())?;
     Ok(Some(ReevaluatedPolicy {
         before: best.return_mean,

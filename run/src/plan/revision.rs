@@ -5,10 +5,12 @@
 //! between two of them the next resume finds the same difference again and does what is left.
 
 use std::collections::BTreeSet;
+use std::io::Write;
 
 use anyhow::{Context, bail};
 use shoal_common::commit::CommitReader;
 use shoal_common::config::{Change, Config, Difference, Mode};
+use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_common::section;
 use shoal_learner::process::replay_layout;
@@ -170,12 +172,20 @@ impl Revision {
 pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> anyhow::Result<Config> {
     let mut config = used.clone();
     config.actors.count = actors;
-    let edited = Config::load(&run.config_file()).ok();
+    let path = run.config_file();
+    let edited = Config::load(&path).ok();
     if edited.as_ref() == Some(&as_written(used)) {
         run.write_config(&as_written(&config))?;
     } else if let Some(mut edited) = edited {
         edited.actors.count = actors;
         run.write_config(&edited)?;
+    } else if let Some(text) = std::fs::read_to_string(&path)
+        .ok()
+        .and_then(|text| with_actors(&text, actors))
+    {
+        // Half edited: it cannot be read as a whole, but the next resume must not take the old number for a change.
+        let written = write_atomically(&path, |file| file.write_all(text.as_bytes()));
+        written.with_context(|| format!("cannot write {}", path.display()))?;
     }
     let changed = used.actors.count != actors;
     if changed {
@@ -191,6 +201,28 @@ pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> an
     }
     run.write_used_config(&config)?;
     Ok(config)
+}
+
+/// The text of a `config.toml` with another number of actors; `None` if it has no line for that. The rest need not be
+/// TOML.
+fn with_actors(text: &str, actors: u32) -> Option<String> {
+    let mut section = "";
+    let mut found = false;
+    let mut with = String::new();
+    for line in text.split_inclusive('\n') {
+        if line.starts_with('[') {
+            section = line.split(']').next().unwrap_or_default();
+        }
+        match line.split_once('=') {
+            Some((key, rest)) if section == "[actors" && key.trim() == "count" => {
+                let value = rest.split(['#', '\n']).next().unwrap_or_default().trim_end();
+                with += &format!("{key}= {actors}{}", &rest[value.len()..]);
+                found = true;
+            }
+            _ => with += line,
+        }
+    }
+    found.then_some(with)
 }
 
 /// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the
@@ -272,7 +304,8 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
             names.join(", ")
         );
     }
-    if run.replay_file().exists() && replay_layout(config) != replay_layout(used) {
+    let may_have_replay = !matches!(run.replay_file().try_exists(), Ok(false));
+    if may_have_replay && replay_layout(config) != replay_layout(used) {
         bail!("{names}: cannot change in this run: its replay.bin was made for other sizes");
     }
     if used.run.mode == Mode::Free {
@@ -307,4 +340,49 @@ fn newest_round(config: &Config, run: &RunDir) -> anyhow::Result<u64> {
     };
     let rounds = (0..config.actors.max as usize).map(|actor| commits.committed(actor).sequence);
     Ok(rounds.max().unwrap_or(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::resolve_preset;
+
+    #[test]
+    fn a_run_is_scaled_while_its_configuration_is_half_edited() {
+        let used = resolve_preset("pendulum").unwrap();
+        let written = used.to_toml().unwrap();
+        let count = format!("count = {}", used.actors.count);
+        assert_eq!(written.matches(&count).count(), 1, "{written}");
+        let commented = written.replace(&count, &format!("{count}  # not enough?"));
+        // Not TOML yet, and a value that is refused.
+        for (half, whole) in [
+            (format!("{commented}\n[learn"), commented.clone()),
+            (commented.replace("[actors]", "[actors]\nwindow = "), commented.clone()),
+            (commented.replace("steps = ", "steps = -"), commented.clone()),
+        ] {
+            let parent = tempfile::tempdir().unwrap();
+            let run = RunDir::create(&parent.path().join("run")).unwrap();
+            run.write_used_config(&used).unwrap();
+            std::fs::write(run.config_file(), &half).unwrap();
+            let now = Moment::of_records(&run).unwrap();
+            let scaled = store_actors(&run, &used, used.actors.count + 1, now).unwrap();
+            let more = format!("count = {}  # not enough?", used.actors.count + 1);
+            let text = std::fs::read_to_string(run.config_file()).unwrap();
+            assert_eq!(text, half.replace(&format!("{count}  # not enough?"), &more));
+            // The user goes on, and resumes the run.
+            std::fs::write(
+                run.config_file(),
+                whole.replace(&format!("{count}  # not enough?"), &more),
+            )
+            .unwrap();
+            let revision = Revision::new(&run, &scaled, &RequestedChanges::default()).unwrap();
+            assert_eq!(revision.changes.len(), 0, "{:?}", revision.changes);
+        }
+        assert_eq!(with_actors("[learner]\ncount = 1\n", 2), None);
+        assert_eq!(with_actors("[actors]\ncount\n", 2), None);
+        assert_eq!(
+            with_actors("[actors]\ncount = ", 2).as_deref(),
+            Some("[actors]\ncount = 2 ")
+        );
+    }
 }

@@ -3,6 +3,7 @@
 
 use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
+use shoal_common::durable::allocated_bytes;
 use shoal_common::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::{self, SizeError};
@@ -62,11 +63,19 @@ pub(super) fn disk(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     } else {
         0
     };
-    let kept = policies.checked_mul((size_of::<f32>() * parameters(config)) as u64 + POLICY_HEADER);
+    let kept = policies
+        .checked_mul((size_of::<f32>() * parameters(config)) as u64 + POLICY_HEADER)
+        .map(|kept| kept.saturating_sub(kept_policies(run)));
     let sum = kept.and_then(|kept| learner.checked_add(kept)?.checked_add(RECORDS));
     sum.ok_or(SizeError::Sum {
         capacity: config.replay.capacity,
     })
+}
+
+/// Bytes of disk that the run's kept policies occupy; 0 if they cannot be listed.
+fn kept_policies(run: &RunDir) -> u64 {
+    let entries = std::fs::read_dir(run.policies()).into_iter().flatten().flatten();
+    entries.map(|entry| allocated_bytes(&entry.path())).sum()
 }
 
 /// Parameters of the policy; 0 for an algorithm that cannot control the environment, which is refused elsewhere.
@@ -104,5 +113,30 @@ mod tests {
             needed <= before - RESERVED && needed > before / 2,
             "{needed} of {before}"
         );
+    }
+
+    #[test]
+    fn what_checkpoints_and_kept_policies_occupy_is_not_needed_again() {
+        let mut config = resolve_preset("pendulum").unwrap();
+        config.evaluation.keep_policies = true;
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDir::at(directory.path());
+        std::fs::create_dir(run.checkpoints()).unwrap();
+        std::fs::create_dir(run.policies()).unwrap();
+        let mut needed = disk(&config, &run).unwrap();
+        let checkpoints = ["latest.ckpt", "previous.ckpt", "latest.ckpt.new"].map(|name| run.checkpoints().join(name));
+        let policies = [run.best_policy(), run.last_policy(), run.evaluated_policy(100)];
+        for path in checkpoints.into_iter().chain(policies) {
+            // As much as one disk block of most file systems.
+            let file = File::create(&path).unwrap();
+            fallocate(&file, FallocateFlags::empty(), 0, 4 << 10).unwrap();
+            let rest = disk(&config, &run).unwrap();
+            assert!(rest <= needed - (4 << 10), "{}: {rest} of {needed}", path.display());
+            needed = rest;
+        }
+        // More than a run of this length needs.
+        let other = File::create(run.evaluated_policy(200)).unwrap();
+        fallocate(&other, FallocateFlags::empty(), 0, 1 << 30).unwrap();
+        assert!(disk(&config, &run).unwrap() >= RECORDS);
     }
 }

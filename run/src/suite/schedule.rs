@@ -237,5 +237,5 @@ fn train_one(
     }
     command.arg("--quiet");
     // Tied to this process: if that is killed, the run ends and can be resumed with the suite.
-    run_training(&mut tied(&command)?, interrupted)
+    run_training(&mut tied(&command)?, interrupted, || check_finished(suite, &run))
 }
