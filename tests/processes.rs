@@ -146,7 +146,9 @@ fn a_run_without_free_file_descriptors_continues_when_there_are_some_again() {
     });
     running.kill("actor-0");
     let is_refused = |line: &&str| line.starts_with("actor-0 ") && line.contains("trying again in");
-    until("the actor cannot be started", || running.log().lines().filter(is_refused).count() >= 2);
+    until("the actor cannot be started", || {
+        running.log().lines().filter(is_refused).count() >= 2
+    });
     assert!(running.pids("actor-0").is_empty());
     limit(before);
     until("the actor is started again", || running.pids("actor-0").len() == 1);

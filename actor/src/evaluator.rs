@@ -407,10 +407,10 @@ mod tests {
         let path = directory.path().join("best.policy");
         let network = NetworkLayout::new(1, Hidden::relu([1, 1]), 1);
         let layout = PolicyLayout::Deterministic(network);
-        assert!(Best::kept(&path, &layout).unwrap().is_none());
+        assert!(EvaluatedPolicy::kept(&path, &layout).unwrap().is_none());
         // To follow it fails, also for root.
         std::os::unix::fs::symlink(&path, &path).unwrap();
-        assert!(Best::kept(&path, &layout).is_err());
+        assert!(EvaluatedPolicy::kept(&path, &layout).is_err());
     }
 
     #[test]

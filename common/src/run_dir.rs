@@ -523,7 +523,11 @@ mod tests {
         std::fs::create_dir(&suite).unwrap();
         std::fs::write(suite.join("suite.json"), "").unwrap();
         let refused = || RunDir::open(&suite).unwrap_err().to_string();
-        assert!(refused().contains("none has begun: shoal resume "), "{}", refused());
+        assert!(
+            refused().contains("none of its runs has begun: shoal resume "),
+            "{}",
+            refused()
+        );
         for seed in [10, 2, 1, 3, 4] {
             let run = suite.join(format!("seed={seed}"));
             std::fs::create_dir(&run).unwrap();

@@ -13,7 +13,9 @@ mod support;
 use std::process::Command;
 
 use shoal_common::stream::{Purpose, stream};
-use shoal_env_server::environment::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step};
+use shoal_env_server::environment::{
+    Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step, check_time_limit,
+};
 
 use support::{Leftovers, Workplace};
 

@@ -8,7 +8,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step};
+use super::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step, check_time_limit};
 
 /// Δt in s.
 const DT: f64 = 0.05;
@@ -45,6 +45,7 @@ pub struct Rail {
 impl Rail {
     /// At rest in the middle.
     pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+        check_time_limit(parameters.time_limit)?;
         Ok(Self {
             parameters,
             x: 0.0,

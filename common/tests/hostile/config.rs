@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 use shoal_common::commit::ReplayLayout;
-use shoal_common::config::Config;
+use shoal_common::config::{ActorsConfig, Config};
 use toml::{Table, Value};
 
 const WHOLE: &str = r#"
@@ -99,7 +99,7 @@ fn assert_usable(config: &Config) {
         let network = ddpg.networks(&config.spec).critic;
         assert!(network.parameters().checked_mul(size_of::<f32>() * batch).is_some());
     }
-    assert!(config.evaluation_server() < 257 && (1..=64).contains(&config.evaluation_envs()));
+    assert!(config.evaluation_server() <= ActorsConfig::MAX_ACTORS && (1..=64).contains(&config.evaluation_envs()));
     assert_eq!(config.evaluation.period(0), 0);
     assert!(std::time::Duration::try_from_secs_f64(config.checkpoint.every_seconds).is_ok());
     let written = config.to_toml().unwrap().parse().unwrap();
