@@ -61,14 +61,22 @@ impl RunClient {
         patience: Duration,
     ) -> anyhow::Result<Option<ControlResponse>> {
         let _sweeper = Sweeper::start(domain)?;
-        let lives = || self.run.is_running().unwrap_or(true);
         let is_about_status = request == ControlRequest::Status;
+        // In its final evaluation a launcher has no roles, and answers nothing.
+        let is_too_late = || {
+            let reason = self.reason_for_no_roles();
+            !is_about_status && reason.is_ok_and(|reason| reason == Some(OutcomeReason::FinalEvaluation))
+        };
+        let lives = || self.run.is_running().unwrap_or(true) && !is_too_late();
         match control::ask(domain, self.run.directory_id()?, request, patience, lives) {
             Ok(ControlResponse::AnotherRun(there)) => {
                 let here = self.run.path().display();
                 bail!("{here} is a copy of {there}, which is running; the launcher in {here} waits for it to end")
             }
             Ok(answer) => Ok(Some(answer)),
+            Err(ControlError::Gone) if is_too_late() && self.run.is_running()? => {
+                bail!("{}", in_final_evaluation(&self.run))
+            }
             Err(ControlError::Gone) => Ok(None),
             Err(ControlError::Missing) if domain.has_members() && self.reason_for_no_roles()?.is_none() => {
                 bail!("{}", self.files_removed(domain)?)
@@ -162,8 +170,12 @@ impl RunClient {
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        // Without an answer, the run has ended for another reason, which its own terminal reports.
-        answer.map_or(Ok(()), accepted)
+        match answer {
+            Some(answer) => accepted(answer),
+            None if saved_status(&self.run.config()?, &self.run)?.finished => bail!("{}", self.not_running()),
+            // It has ended for another reason, which its own terminal reports.
+            None => Ok(()),
+        }
     }
 
     /// Why nothing can be asked, and what continues the run. A finished run needs a new limit.
