@@ -238,18 +238,17 @@ impl Supervisor {
     /// # Errors
     /// When the system has refused for too long.
     fn start(&mut self, i: usize) -> anyhow::Result<bool> {
-        let process = match self.start_process(i) {
-            Ok(process) => process,
-            Err(error) => return self.handle_refused_start(i, error).map(|()| false),
-        };
-        let child = &mut self.children[i];
-        self.log
-            .note(&name(child.instance), &format!("started as process {}", process.pid()));
-        child.begin(process);
-        Ok(true)
+        match self.start_now(i) {
+            Ok(()) => Ok(true),
+            Err(error) => self.handle_refused_start(i, error).map(|()| false),
+        }
     }
 
-    fn start_process(&mut self, i: usize) -> anyhow::Result<Process> {
+    /// Starts a role's process.
+    ///
+    /// # Errors
+    /// When the counter of incarnations cannot be written, or the system refuses.
+    fn start_now(&mut self, i: usize) -> anyhow::Result<()> {
         let incarnation = self.take_incarnations(1)?;
         let child = &mut self.children[i];
         child.instance.incarnation = incarnation;
@@ -257,7 +256,11 @@ impl Supervisor {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
         };
-        Process::start(child.instance, &self.run, &self.log, writer)
+        let process = Process::start(child.instance, &self.run, &self.log, writer)?;
+        self.log
+            .note(&name(child.instance), &format!("started as process {}", process.pid()));
+        child.begin(process);
+        Ok(())
     }
 
     fn handle_refused_start(&mut self, i: usize, error: anyhow::Error) -> anyhow::Result<()> {
@@ -307,9 +310,7 @@ impl Supervisor {
             self.note_incident(i, kind_of_end(status), describe_exit(status));
         }
         self.cleaning.clean(domain, &self.services, &self.log);
-        if !self.start(i)? {
-            return Ok(false);
-        }
+        self.start_now(i)?;
         self.children[i].restarts += 1;
         if role == Role::Learner {
             self.unsaved_learner = None;
