@@ -11,11 +11,10 @@ pub mod point_mass;
 mod signal;
 
 pub use drawing::{Class, Drawing, Form, Point, Shape};
-pub use error::{EnvironmentError, RequestError, check, check_time_limit};
+pub use error::{EnvironmentError, OutOfRange, RequestError, check, check_time_limit};
 pub use interface::{Environment, Step};
 use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
-pub use shoal_base::section::OutOfRange;
 use shoal_base::section::{self, Key};
 pub use signal::{Goal, Picture, Signal, SignalSource};
 

@@ -126,9 +126,9 @@ impl LeaseKeeper {
     }
 
     /// Says whether the run has ended since the host was admitted.
-    pub fn run_is_over(&self) -> impl Fn() -> bool + use<> {
+    pub fn run_is_over(&self) -> Box<dyn Fn() -> bool> {
         let run_is_over = Arc::clone(&self.run_is_over);
-        move || run_is_over.load(Ordering::Relaxed)
+        Box::new(move || run_is_over.load(Ordering::Relaxed))
     }
 
     /// Ends the reports, because the relay sends them from now on. The connection may take a while to close.

@@ -194,7 +194,7 @@ fn the_least_and_the_greatest_allowed_numbers_do_not_overflow() {
             largest.actors.count,
             largest.row_layout().action_width()
         ),
-        (256, 256, 4096)
+        (ActorsConfig::MAX_ACTORS, ActorsConfig::MAX_ON_A_HOST, 4096)
     );
     assert_usable(&largest);
 }

@@ -2,7 +2,8 @@
 
 use std::ops::RangeInclusive;
 
-use shoal_base::section::{OutOfRange, from, in_user_words, refusal};
+pub use shoal_base::section::OutOfRange;
+use shoal_base::section::{from, in_user_words, refusal};
 
 /// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
