@@ -1,5 +1,7 @@
 //! Receives the actors' chunks and appends them to the replay, each exactly once.
 
+use std::collections::BTreeSet;
+
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
 use shoal_common::numbers::are_finite;
@@ -40,6 +42,8 @@ pub struct Intake {
     actors: Vec<ActorChunks>,
     /// Of the actors that share a service. They need no notification: the gate reads the commit record.
     shared: Option<ChunkReceiver>,
+    /// The actors whose chunks have come through it. It gets as many turns.
+    sharing: BTreeSet<u32>,
     chunk: ChunkLayout,
     window: u32,
     /// The number of rows beyond which none are taken.
@@ -70,6 +74,7 @@ impl Intake {
         let mut intake = Self {
             actors: Vec::new(),
             shared: None,
+            sharing: BTreeSet::new(),
             chunk,
             window,
             limit,
@@ -109,7 +114,8 @@ impl Intake {
     }
 
     /// Takes one chunk of each actor in turn, until none is waiting, `most` of each were taken, or `enough` returns
-    /// true. Those that share a service count as one. Returns whether any chunk was taken.
+    /// true. Chunks of actors that share a service are taken in the order in which they come. Returns whether any chunk
+    /// was taken.
     ///
     /// # Errors
     /// When a channel fails, or a chunk does not belong to this run.
@@ -119,22 +125,30 @@ impl Intake {
         most: u32,
         enough: impl Fn(&Replay) -> bool,
     ) -> Result<bool, IntakeError> {
-        let sources = self.actors.len() + usize::from(self.shared.is_some());
+        let shared_turns = usize::from(self.shared.is_some()).max(self.sharing.len());
+        let turns = self.actors.len() + shared_turns;
         let (mut any, mut idle) = (false, 0);
-        for _ in 0..u64::from(most) * sources as u64 {
-            if idle == sources || enough(replay) || replay.head() >= self.limit {
+        for _ in 0..u64::from(most) * turns as u64 {
+            if idle >= turns || enough(replay) || replay.head() >= self.limit {
                 break;
             }
-            let taken = match self.actors.get(self.turn) {
-                Some(_) => self.take_from(self.turn, replay)?,
-                None => self.take_shared(replay)?,
+            let has_own_service = self.turn < self.actors.len();
+            let taken = if has_own_service {
+                self.take_from(self.turn, replay)?
+            } else {
+                self.take_shared(replay)?
+            };
+            // All turns of an empty service are over at once.
+            let passed = match taken {
+                None if !has_own_service => turns - self.turn,
+                _ => 1,
             };
             if taken.is_some() {
                 (any, idle) = (true, 0);
             } else {
-                idle += 1;
+                idle += passed;
             }
-            self.turn = (self.turn + 1) % sources;
+            self.turn = (self.turn + passed) % turns;
         }
         Ok(any)
     }
@@ -154,12 +168,14 @@ impl Intake {
         Ok(Some(appended))
     }
 
-    fn take_shared(&self, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
+    fn take_shared(&mut self, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
         let Some(chunk) = self.shared.as_ref().map(ChunkReceiver::receive).transpose()?.flatten() else {
             return Ok(None);
         };
-        let actor = chunk.header().actor as usize;
-        self.append(replay, actor, &chunk).map(Some)
+        let actor = chunk.header().actor;
+        let appended = self.append(replay, actor as usize, &chunk)?;
+        self.sharing.insert(actor);
+        Ok(Some(appended))
     }
 
     /// Appends the rows of a chunk, as many as the limit allows.
