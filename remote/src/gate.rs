@@ -303,11 +303,10 @@ impl<'a> Gate<'a> {
         // Processes of a host that was admitted again may have incarnations of an earlier lease.
         let ours = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
-        let shares = chunk.header.actor >= self.settings.config.actors.max_on_a_host();
-        let forwarder = if shares {
-            &self.shared_forwarder
-        } else {
+        let forwarder = if self.settings.config.actors.has_own_service(chunk.header.actor) {
             &actor.forwarder
+        } else {
+            &self.shared_forwarder
         };
         let Some(forwarder) = forwarder else {
             return Ok(0);
@@ -350,7 +349,7 @@ impl<'a> Gate<'a> {
         host.has_left = report.leaving;
         for role in &report.roles {
             // The learner then opens the actor's own service.
-            let has_own_service = role.index < self.settings.config.actors.max_on_a_host();
+            let has_own_service = self.settings.config.actors.has_own_service(role.index);
             if role.role == Role::Actor && has_own_service && host.lease.actors.contains(&role.index) {
                 self.heartbeats.send(role.heartbeat());
             }
@@ -522,7 +521,7 @@ impl<'a> Gate<'a> {
         let (layout, window) = (config.chunk_layout(), config.actors.window);
         let mut any_shares = false;
         for (index, actor) in &mut self.actors {
-            if *index >= config.actors.max_on_a_host() {
+            if !config.actors.has_own_service(*index) {
                 any_shares = true;
             } else if actor.forwarder.is_none() {
                 actor.forwarder = ChunkForwarder::try_open(self.domain, *index, layout, window)?;

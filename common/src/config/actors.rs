@@ -31,6 +31,11 @@ impl ActorsConfig {
     /// The upper bound of `max`.
     pub const MAX_ACTORS: u32 = Self::MAX_ON_A_HOST + 1_024;
 
+    /// Whether the actor with this index has a service of its own for its transitions on the learner's host.
+    pub fn has_own_service(&self, actor: u32) -> bool {
+        actor < self.max_on_a_host()
+    }
+
     /// The most actors that one host may have.
     pub fn max_on_a_host(&self) -> u32 {
         self.max.min(Self::MAX_ON_A_HOST)

@@ -20,7 +20,7 @@ use super::settings::{LearnerError, LearnerSettings, replay_layout};
 use crate::algorithms::algorithm::{Algorithm, SavedState};
 use crate::algorithms::registry;
 use crate::networks::threads::Threads;
-use crate::replay::{Replay, SyncedRows};
+use crate::replay::{Replay, ReplayError, SyncedRows};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -69,10 +69,9 @@ impl<'a> Learner<'a> {
         }
         let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
         let (layout, file) = (replay_layout(config), run.replay_file());
-        let replay = if file.exists() {
-            Replay::open(&file, &layout)?
-        } else {
-            Replay::create(&file, &layout)?
+        let replay = match Replay::open(&file, &layout) {
+            Err(ReplayError::Missing(_)) => Replay::create(&file, &layout)?,
+            opened => opened?,
         };
         replay.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
 
@@ -193,7 +192,7 @@ impl<'a> Learner<'a> {
         }
         self.actors_checked_at = Instant::now();
         while let Some(heartbeat) = self.heartbeats.receive()? {
-            let has_own_service = heartbeat.index < self.settings.config.actors.max_on_a_host();
+            let has_own_service = self.settings.config.actors.has_own_service(heartbeat.index);
             if heartbeat.role() == Some(Role::Actor) && has_own_service {
                 self.intake.open_receivers(self.domain, heartbeat.index + 1)?;
             }

@@ -136,6 +136,11 @@ fn a_replay_is_created_once_and_has_one_writer() {
     let directory = Directory::new();
     let path = directory.replay();
     assert!(matches!(Replay::open(&path, &layout(10)), Err(ReplayError::Missing(_))));
+    // What cannot be inspected, here also by root, is not missing.
+    std::os::unix::fs::symlink(&path, &path).unwrap();
+    let opened = Replay::open(&path, &layout(10));
+    assert!(!matches!(opened, Ok(_) | Err(ReplayError::Missing(_))), "{opened:?}");
+    std::fs::remove_file(&path).unwrap();
     assert!(matches!(CommitReader::open(&path), Err(OpenError::NotYet { .. })));
     assert!(CommitReader::open_if_ready(&path).unwrap().is_none());
     // Left by a learner that was killed while it created the file.
