@@ -8,6 +8,7 @@ mod support;
 use std::path::Path;
 
 use serde_json::Value;
+use shoal_common::commit::CommitReader;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use support::{Workplace, error_line, json, until};
@@ -412,16 +413,18 @@ const LOCKSTEP: [&str; 4] = ["--lockstep", "--set", "checkpoint.every_updates=10
 #[test]
 fn a_lockstep_run_has_the_same_bits_after_the_same_change_at_the_same_step() {
     let place = Workplace::new();
-    let mut weights = Vec::new();
-    for name in ["first", "second"] {
-        place.train(&[&["pendulum", "--steps", "400", "--run", name][..], &LOCKSTEP].concat());
+    let changed = |name: &str, steps| {
+        place.train(&[&["pendulum", "--steps", steps, "--run", name][..], &LOCKSTEP].concat());
         let set = ["--set", "ddpg.actor_learning_rate=0.01", "--set", "ddpg.batch=16"];
         let change = [&["resume", name, "--steps", "800", "--json"][..], &set].concat();
         let output = place.output(&change);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        weights.push(json(&output)["weights_sha256"].clone());
-    }
+        json(&output)["weights_sha256"].clone()
+    };
+    let weights = [changed("first", "400"), changed("second", "400")];
     assert_eq!(weights[0], weights[1]);
+    // The last round of 408 steps has no place for rows of the second actor.
+    assert_eq!(changed("third", "408"), changed("fourth", "408"));
     place.train(&[&["pendulum", "--steps", "400", "--run", "run"][..], &LOCKSTEP].concat());
     let (result, _) = resume(&place, &["--steps", "800"]);
     assert_ne!(result["weights_sha256"], weights[0]);
@@ -441,6 +444,16 @@ fn a_lockstep_run_has_the_same_bits_after_the_same_change_at_the_same_step() {
         let (message, code) = refused(&place, &["--steps", "900", "--set", set]);
         assert!(message.contains(part) && code == 2, "{set}: {message}");
     }
+}
+
+#[test]
+fn all_actors_send_as_many_chunks_also_in_a_last_round_that_is_cut() {
+    let place = Workplace::new();
+    place.train(&[&["pendulum", "--steps", "408", "--run", "run"][..], &LOCKSTEP].concat());
+    let commits = CommitReader::open(&place.path().join("run/replay.bin")).unwrap();
+    let [first, second] = [0, 1].map(|actor| (commits.actor(actor).rows, commits.committed(actor).sequence));
+    assert!(first.0 > second.0, "the last round is cut");
+    assert_eq!(first.1, second.1);
 }
 
 #[test]

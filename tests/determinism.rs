@@ -233,6 +233,24 @@ fn a_lockstep_run_interrupted_several_times_ends_with_the_bits_of_an_undisturbed
 }
 
 #[test]
+fn a_learner_that_makes_no_updates_needs_no_row_again() {
+    let place = Workplace::new();
+    let arguments = [
+        "--lockstep",
+        "--steps",
+        "200000",
+        "--set",
+        "replay.updates_per_step=0",
+        "--set",
+        "replay.capacity=1000",
+    ];
+    let running = place.start("run", &arguments);
+    wait_for_rows(&running, 5000);
+    running.kill("learner-0");
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+}
+
+#[test]
 fn one_lockstep_actor_gives_the_bits_of_algorithm_4_in_a_single_process() {
     for (preset, warmup) in [
         ("pendulum", "policy"),

@@ -19,7 +19,7 @@ use shoal_common::channel::environment::{
     EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult,
 };
 use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
-use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::reports::{Report, Reporter};
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
 use shoal_common::commit::CommitReader;
@@ -40,6 +40,10 @@ use crate::n_step::NStepTransitions;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// The time in which an actor reports at most half as many episodes as their channel holds. A launcher that may get so
+/// many reads them twice in this time.
+const REPORT_SPAN: Duration = Duration::from_millis(40);
 
 /// The settings of an actor.
 #[derive(Clone, Debug)]
@@ -119,6 +123,10 @@ struct Actor<'a> {
     ending_since: Option<Instant>,
     /// Episodes that ended in the chunk that is being filled.
     ended: Vec<EpisodeReport>,
+    /// When the current [`REPORT_SPAN`] began, and the episodes reported in it.
+    reported: (Instant, usize),
+    /// Whether the environment server has begun no episode for this actor yet.
+    server_is_new: bool,
 }
 
 impl<'a> Actor<'a> {
@@ -186,6 +194,8 @@ impl<'a> Actor<'a> {
             snapshot,
             ending_since: None,
             ended: Vec::new(),
+            reported: (Instant::now(), 0),
+            server_is_new: true,
             n_step: NStepTransitions::new(settings.n_step, settings.envs, row),
             chunk: sender.begin()?,
             policy_version: 0,
@@ -203,7 +213,10 @@ impl<'a> Actor<'a> {
     fn run(&mut self) -> Exit<ActorError> {
         loop {
             match self.run_until_server_lost() {
-                Ok(()) => tracing::warn!("the environment server was restarted"),
+                Ok(()) => {
+                    self.server_is_new = true;
+                    tracing::warn!("the environment server was restarted");
+                }
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
                     if let Err(exit) = after_fault(&error, &mut self.heartbeat, &self.listener, self.stop) {
                         return exit.convert();
@@ -217,6 +230,7 @@ impl<'a> Actor<'a> {
     /// Drops the current episodes and begins new ones. In lockstep it continues the episodes of the last snapshot
     /// instead, if there is one.
     fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
+        let server_is_new = std::mem::replace(&mut self.server_is_new, false);
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
@@ -242,8 +256,10 @@ impl<'a> Actor<'a> {
         // A row of n steps is complete n − 1 steps after it began.
         let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
-        let request = if sent == 0 {
-            ResetRequest::Training(0)
+        // A new server would begin with episode 0 again, and repeat its random numbers. There are never fewer steps than
+        // episodes. After an invalid answer another episode begins: the same one may end in the same way.
+        let request = if server_is_new || sent == 0 {
+            ResetRequest::Training(self.step)
         } else {
             ResetRequest::Next
         };
@@ -326,16 +342,21 @@ impl<'a> Actor<'a> {
         };
         let newest = match latest(policy)? {
             Some(newest) => newest,
-            None => wait_for(
-                listener,
-                stop,
-                || latest(policy),
-                || {
-                    heartbeat.beat(Activity::WaitingForPeer);
-                    // A restarted learner may need the last chunks before it can publish a policy.
-                    sender.refresh_connections()
-                },
-            )?,
+            None => {
+                let begun = Instant::now();
+                let newest = wait_for(
+                    listener,
+                    stop,
+                    || latest(policy),
+                    || {
+                        heartbeat.beat(Activity::WaitingForPeer);
+                        // A restarted learner may need the last chunks before it can publish a policy.
+                        sender.refresh_connections()
+                    },
+                )?;
+                tracing::debug!(waited_us = microseconds(begun), "waited for a policy");
+                newest
+            }
         };
         self.heartbeat.set_policy_version(newest.header().version);
         Ok(newest)
@@ -444,6 +465,7 @@ impl<'a> Actor<'a> {
         if has_capacity().is_some() {
             return Ok(());
         }
+        let begun = Instant::now();
         wait_for(
             listener,
             stop,
@@ -453,6 +475,7 @@ impl<'a> Actor<'a> {
                 sender.refresh_connections()
             },
         )?;
+        tracing::debug!(waited_us = microseconds(begun), "waited for space in the window");
         // A busy learner may notify before the first heartbeat of this wait; the launcher must see even a short wait.
         heartbeat.beat(Activity::WaitingForRatio);
         Ok(())
@@ -463,7 +486,18 @@ impl<'a> Actor<'a> {
         let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
         self.sender.send(chunk, self.policy_version)?;
         self.learner.notify();
-        self.ended.drain(..).for_each(|episode| self.episodes.send(episode));
+        for episode in self.ended.drain(..) {
+            let (since, count) = &mut self.reported;
+            if since.elapsed() >= REPORT_SPAN {
+                (*since, *count) = (Instant::now(), 0);
+            } else if *count == EpisodeReport::BUFFER / 2 {
+                // The launcher must have read these: a full channel loses its oldest reports.
+                std::thread::sleep(REPORT_SPAN);
+                (*since, *count) = (Instant::now(), 0);
+            }
+            *count += 1;
+            self.episodes.send(episode);
+        }
         Ok(())
     }
 
@@ -502,6 +536,10 @@ impl<'a> Actor<'a> {
         }
         Ok(true)
     }
+}
+
+fn microseconds(begun: Instant) -> u64 {
+    u64::try_from(begun.elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
 fn wait_for_replay(

@@ -14,7 +14,7 @@ use crate::error::ActorError;
 pub const EPISODES_DROPPED: &str = "its episodes are given up";
 
 /// How long an actor waits after an invalid answer before it begins new episodes.
-const AFTER_FAULT: Duration = Duration::from_millis(50);
+const PAUSE_AFTER_FAULT: Duration = Duration::from_millis(50);
 
 /// Connects to environment server `index` and checks that it serves the environments of the run's configuration.
 pub(crate) fn connect(
@@ -50,11 +50,11 @@ pub(crate) fn after_fault(
     tracing::warn!("{error}; {EPISODES_DROPPED}");
     heartbeat.count_fault();
     let since = Instant::now();
-    while since.elapsed() < AFTER_FAULT {
+    while since.elapsed() < PAUSE_AFTER_FAULT {
         if stop.requested() {
             return Err(Exit::Stopped);
         }
-        listener.wait(AFTER_FAULT)?;
+        listener.wait(PAUSE_AFTER_FAULT)?;
     }
     Ok(())
 }

@@ -166,8 +166,10 @@ impl<'a> Evaluator<'a> {
         )?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = EvaluatedPolicy::kept(&settings.run.best_policy(), &layout)?;
-        heartbeat.beat(Activity::WaitingForPeer);
         let state = EvaluatorState::read(&settings.run.evaluator_state())?;
+        // The launcher compares what the evaluator begins with after failures.
+        heartbeat.set_policy_version(state.last().map_or(0, |evaluation| evaluation.policy_version));
+        heartbeat.beat(Activity::WaitingForPeer);
         let reports = Reporter::open(domain)?;
         // The launcher skips evaluations that it has already recorded.
         state.evaluations().for_each(|evaluation| reports.send(*evaluation));

@@ -120,6 +120,8 @@ mod tests {
         let whole = std::fs::read(&path).unwrap();
         std::fs::write(&path, &whole[..whole.len() - 1]).unwrap();
         assert_eq!(EvaluatorState::read(&path).unwrap(), EvaluatorState::default());
+        std::fs::write(&path, vec![0; whole.len()]).unwrap();
+        assert_eq!(EvaluatorState::read(&path).unwrap(), EvaluatorState::default());
         std::fs::write(&path, [b"SHOALCHK".as_slice(), &whole[8..]].concat()).unwrap();
         let refused = EvaluatorState::read(&path).unwrap_err().to_string();
         assert!(

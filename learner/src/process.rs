@@ -6,20 +6,24 @@
 //! ```
 
 pub mod checkpoint;
+mod error;
 mod evaluation_wait;
 mod free;
 pub mod intake;
 mod learner;
 mod lockstep;
 mod settings;
+mod sizes;
 
 use shoal_common::channel::Domain;
 use shoal_common::config::Mode;
 use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 
+pub use self::error::LearnerError;
 use self::learner::Learner;
-pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes, replay_layout};
+pub use self::settings::LearnerSettings;
+pub use self::sizes::{SizeError, disk_bytes, replay_layout};
 
 /// Learns until all of the run's environment steps are collected and learned from, or until `stop`. Saves its state in
 /// both cases.

@@ -96,6 +96,54 @@ fn q_learning_finds_the_values_of_the_lake_and_a_policy_that_reaches_the_goal() 
 }
 
 #[test]
+fn free_q_learning_learns_from_each_row_once_also_with_a_small_ring() {
+    let place = Workplace::new();
+    let set = ["run.mode=free", "replay.capacity=300", "replay.tolerance=20000"];
+    let set = set.map(|key| ["--set", key]).concat();
+    let result = train(
+        &place,
+        &[&["frozen-lake", "--steps", "50000", "--episodes", "1000000"], &set[..]].concat(),
+    );
+    assert_eq!(result["updates"], 50_000);
+    let log = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
+    assert!(!log.contains("were overwritten"), "{log}");
+}
+
+#[test]
+fn every_episode_is_recorded_however_many_end_in_a_chunk() {
+    let place = Workplace::new();
+    // With a window of one chunk, little more is sent than is learned from.
+    let set = [
+        "actors.chunk_steps=64",
+        "actors.max=1",
+        "actors.window=1",
+        "replay.updates_per_step=0",
+        "replay.capacity=1000000",
+    ];
+    let set = set.map(|key| ["--set", key]).concat();
+    let size = [
+        "--actors",
+        "1",
+        "--envs",
+        "2048",
+        "--steps",
+        "1310720",
+        "--episodes",
+        "100000000",
+    ];
+    let result = train(
+        &place,
+        &[&["cart-pole", "--method", "dqn"], &size[..], &set[..]].concat(),
+    );
+    let ended = result["episodes"].as_u64().unwrap();
+    let most_of_a_buffer = 10 * 4_096;
+    assert!(
+        recorded(&place, "run") >= ended && ended > most_of_a_buffer,
+        "{ended} episodes ended"
+    );
+}
+
+#[test]
 fn q_learning_gives_the_bits_of_algorithm_2_in_a_single_process() {
     gives_the_bits_of_its_twin("frozen-lake", "q-learning");
 }

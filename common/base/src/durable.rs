@@ -210,6 +210,10 @@ pub fn unseal(kind: FileKind, mut bytes: Vec<u8>) -> Result<Vec<u8>, SealError> 
         return Err(SealError::Checksum);
     };
     if *magic != kind.magic {
+        // A power loss may leave zeros where the file was not on the disk yet.
+        if *magic == [0; 8] {
+            return Err(SealError::Checksum);
+        }
         return Err(SealError::Kind(kind.name));
     }
     // The checksum comes before the version: the envelope is the same in every version, so a damaged version number is

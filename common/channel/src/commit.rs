@@ -11,7 +11,7 @@ mod reader;
 mod record;
 mod words;
 
-pub use layout::{FileOffsets, PreambleError, ReplayLayout, SLOTS, SYNCED};
+pub use layout::{FileOffsets, MAX_ACTOR_SNAPSHOT_WORDS, PreambleError, ReplayLayout, SLOTS, SYNCED};
 pub use mirror::CommitMirror;
 pub use reader::{CommitReader, OpenError};
 pub use record::{ActorCommit, ChunkId, CommitRecord, MAX_INCARNATION};

@@ -28,7 +28,8 @@ pub trait AlgorithmDefinition {
         Products::default()
     }
 
-    /// The total length of all arrays of the algorithm's state, without the statistics of normalised observations.
+    /// The total length of all arrays of the algorithm's state, without the statistics of normalised observations. It
+    /// is asked for before the algorithm exists.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 
@@ -38,21 +39,24 @@ pub trait Algorithm {
     /// The policy's parameters.
     fn policy(&self) -> Cow<'_, [f32]>;
 
-    /// The layout of the policy's parameters.
+    /// The layout of the policy that `AlgorithmSettings::behaviour` returns. Readers of the policy compare its
+    /// fingerprint with their own.
     fn layout(&self) -> PolicyLayout;
 
-    /// Updates: gradient steps, or consumed rows (`TransitionUse`).
+    /// Updates: gradient steps, or consumed rows for `TransitionUse::Transitions` and `Episodes`. These reach the
+    /// number of rows that `update` was called with.
     fn updates(&self) -> u64;
 
     /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It
-    /// is called while the rows allow more updates than `updates`.
+    /// is called while the rows allow more updates than `updates`, which grows with each call. It reads no row from
+    /// `rows` on. A loss that is not finite ends the run.
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses;
 
     /// Shares the work of updates among these threads from now on, if there is enough of it. The bits of the results do
     /// not depend on them.
     fn set_threads(&mut self, _: Threads) {}
 
-    /// Everything that the next update depends on besides the rows, by name.
+    /// Everything that the next update depends on besides the rows and `updates`, by name. The names never change.
     fn state(&self) -> Vec<StateArray<'_>>;
 
     /// Restores a state of the same algorithm after `updates` updates.

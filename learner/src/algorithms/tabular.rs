@@ -217,6 +217,13 @@ impl Algorithm for Tabular {
     fn update(&mut self, replay: &Replay, _: u64) -> Losses {
         // After a crash of a free run the ring may have lost rows since the checkpoint.
         let row = self.rows.max(replay.rows().start);
+        if row > self.rows {
+            tracing::warn!(
+                "rows {} to {} were overwritten before they were learned from",
+                self.rows,
+                row - 1
+            );
+        }
         self.rows = row + 1;
         let slot = self.slot(row);
         let numbers = replay.row(row);

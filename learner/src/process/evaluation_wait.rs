@@ -8,8 +8,8 @@ use shoal_common::exit::Exit;
 use shoal_common::report::EvaluatedPeriod;
 use shoal_common::role::Activity;
 
+use super::error::LearnerError;
 use super::learner::Learner;
-use super::settings::LearnerError;
 
 /// The evaluator's progress, as far as the learner knows it.
 pub(crate) struct EvaluationWait {
@@ -34,7 +34,7 @@ impl EvaluationWait {
         learner: &mut Learner<'_>,
         timeout: Option<Duration>,
     ) -> Result<(), Exit<LearnerError>> {
-        let due = Some(learner.settings.config.evaluation.period(learner.counted_rows));
+        let due = Some(learner.settings.config.evaluation.period(learner.env_steps));
         let Learner {
             listener,
             stop,

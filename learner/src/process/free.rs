@@ -2,12 +2,13 @@
 
 use std::time::{Duration, Instant};
 
+use shoal_common::algorithms::TransitionUse;
 use shoal_common::exit::Exit;
 use shoal_common::role::Activity;
 
+use super::error::LearnerError;
 use super::evaluation_wait::EvaluationWait;
 use super::learner::Learner;
-use super::settings::LearnerError;
 
 /// Updates between two publications of the policy. Publishing copies the policy's weights once, which takes about a
 /// thirtieth of an update's time.
@@ -21,12 +22,18 @@ const IDLE_WAIT: Duration = Duration::from_millis(50);
 
 /// How long the learner waits for the evaluation of the last policy. A restarted evaluator can get that policy only
 /// from a live learner.
-const LAST_EVALUATION_WAIT: Duration = Duration::from_secs(5);
+const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let replay_config = &learner.settings.config.replay;
     let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
+    // An algorithm that uses each row once needs all rows that it has not used.
+    let uses_each_once = learner.settings.config.algorithm.properties().transition_use == TransitionUse::Transitions;
+    let (chunk, ring) = (
+        learner.settings.config.chunk_rows() as u64,
+        learner.replay.layout().ring,
+    );
     // After a crash the replay is ahead of the checkpoint. Those rows count.
     learner.advance_to(learner.replay.head());
     loop {
@@ -40,11 +47,15 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         let drained = !learner.has_all_steps()
             // After a power loss the replay may have no readable row, although it had many. Then new rows come first.
             && learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
-                !replay.rows().is_empty() && replay_config.learner_is_behind(replay.head(), updates)
+                let head = replay.head();
+                let would_lose_rows = uses_each_once
+                    && head + chunk > updates + ring
+                    && replay_config.allowed_updates(head) > updates;
+                !replay.rows().is_empty() && (would_lose_rows || replay_config.learner_is_behind(head, updates))
             })?;
         learner.advance_to(learner.replay.head());
 
-        if updates < replay_config.allowed_updates(learner.counted_rows) && !learner.replay.rows().is_empty() {
+        if updates < replay_config.allowed_updates(learner.env_steps) && !learner.replay.rows().is_empty() {
             learner.update()?;
             // An update may count for several.
             if learner.updates() / PUBLISH_EVERY > updates / PUBLISH_EVERY {
@@ -54,9 +65,9 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         } else if learner.has_all_steps() {
             learner.publish()?;
             learner.notify_all();
-            return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION_WAIT));
+            return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION_TIMEOUT));
         } else {
-            let activity = if learner.counted_rows < replay_config.ratio_start() {
+            let activity = if learner.env_steps < replay_config.ratio_start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio

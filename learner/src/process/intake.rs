@@ -42,7 +42,7 @@ pub struct Intake {
     actors: Vec<ActorChunks>,
     /// Of the actors that share a service. They need no notification: the gate reads the commit record.
     shared: Option<ChunkReceiver>,
-    /// The actors whose chunks have come through it. It gets as many turns.
+    /// The actors that have sent through the shared service. The service gets a turn for each of them.
     sharing: BTreeSet<u32>,
     chunk: ChunkLayout,
     window: u32,
@@ -138,7 +138,7 @@ impl Intake {
             } else {
                 self.take_shared(replay)?
             };
-            // All turns of an empty service are over at once.
+            // An empty shared service gives up its remaining turns.
             let passed = match taken {
                 None if !has_own_service => turns - self.turn,
                 _ => 1,

@@ -15,9 +15,11 @@ use shoal_common::role::{Activity, Role};
 use shoal_common::stop::Stop;
 
 use super::checkpoint::{Checkpoints, Counters};
+use super::error::LearnerError;
 use super::intake::Intake;
-use super::settings::{LearnerError, LearnerSettings, replay_layout};
-use crate::algorithms::algorithm::{Algorithm, SavedState};
+use super::settings::LearnerSettings;
+use super::sizes::replay_layout;
+use crate::algorithms::algorithm::{Algorithm, Losses, SavedState};
 use crate::algorithms::registry;
 use crate::networks::threads::Threads;
 use crate::replay::{Replay, ReplayError, SyncedRows};
@@ -33,6 +35,24 @@ const QUIET_TIME: Duration = Duration::from_millis(200);
 /// At the end, the learner takes chunks for no longer than this.
 const LAST_CHUNKS_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// Sums over the updates since the last report.
+#[derive(Clone, Copy, Debug, Default)]
+struct LossSums {
+    critic_loss: f64,
+    actor_loss: f64,
+    q_mean: f64,
+    updates: u64,
+}
+
+impl LossSums {
+    fn add(&mut self, losses: Losses) {
+        self.critic_loss += f64::from(losses.critic_loss);
+        self.actor_loss += f64::from(losses.actor_loss);
+        self.q_mean += f64::from(losses.q_mean);
+        self.updates += 1;
+    }
+}
+
 /// The state of the learner's process.
 pub(crate) struct Learner<'a> {
     pub(crate) domain: &'a Domain,
@@ -44,17 +64,18 @@ pub(crate) struct Learner<'a> {
     pub(crate) heartbeat: HeartbeatSender,
     /// Environment steps that count for the ratio: in a free run the replay's head, in lockstep the rows of complete
     /// rounds.
-    pub(crate) counted_rows: u64,
+    pub(crate) env_steps: u64,
     /// Episodes that end within these steps.
     episodes: u64,
     algorithm: Box<dyn Algorithm>,
     pub(crate) publisher: PolicyPublisher,
     evaluator: Notifier,
-    policy_version: u64,
+    /// Version of the policy published last; in lockstep the number of complete rounds.
+    pub(crate) policy_version: u64,
     checkpoints: Checkpoints,
     sync: Option<JoinHandle<io::Result<SyncedRows>>>,
     reporter: Reporter<LearnerReport>,
-    report: LearnerReport,
+    losses: LossSums,
     reported_at: Instant,
     heartbeats: Reports<Heartbeat>,
     actors_checked_at: Instant,
@@ -104,15 +125,17 @@ impl<'a> Learner<'a> {
         };
 
         let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
+        // The launcher compares what the learner begins with after failures.
+        heartbeat.set_policy_version(counters.policy_version);
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
             intake: open_intake(domain, config)?,
             policy_version: counters.policy_version,
-            counted_rows: counters.rows,
+            env_steps: counters.rows,
             episodes: counters.episodes,
             reporter: Reporter::open(domain)?,
-            report: empty_report(),
+            losses: LossSums::default(),
             reported_at: Instant::now(),
             sync: None,
             heartbeats: Reports::open(domain)?,
@@ -138,34 +161,31 @@ impl<'a> Learner<'a> {
         self.algorithm.updates()
     }
 
-    /// Makes the next update, on the replay as it was after `self.counted_rows` rows.
+    /// Makes the next update, on the replay as it was after `self.env_steps` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
         self.heartbeat.begin_work();
-        let losses = self.algorithm.update(&self.replay, self.counted_rows);
+        let losses = self.algorithm.update(&self.replay, self.env_steps);
         if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
             return Err(LearnerError::Diverged {
                 updates: self.algorithm.updates(),
             });
         }
-        self.report.critic_loss += f64::from(losses.critic_loss);
-        self.report.actor_loss += f64::from(losses.actor_loss);
-        self.report.q_mean += f64::from(losses.q_mean);
-        self.report.averaged += 1;
+        self.losses.add(losses);
         self.heartbeat.count(self.updates() - before);
         Ok(())
     }
 
     /// Sets the environment steps that count for the ratio, and counts the episodes that end within them.
     pub(crate) fn advance_to(&mut self, rows: u64) {
-        let newest = self.counted_rows.max(self.replay.rows().start)..rows;
+        let newest = self.env_steps.max(self.replay.rows().start)..rows;
         self.episodes += ended_episodes(&self.replay, newest);
-        self.counted_rows = rows;
+        self.env_steps = rows;
     }
 
     /// Whether all environment steps of the run, or all its episodes, have been collected.
     pub(crate) fn has_all_steps(&self) -> bool {
-        self.settings.config.run.has_all_steps(self.counted_rows, self.episodes)
+        self.settings.config.run.has_all_steps(self.env_steps, self.episodes)
     }
 
     /// Publishes the policy as it is now, as a new version.
@@ -178,7 +198,7 @@ impl<'a> Learner<'a> {
         let header = PolicyHeader {
             incarnation: self.settings.instance.incarnation,
             version: self.policy_version,
-            env_steps: self.counted_rows,
+            env_steps: self.env_steps,
             updates: self.algorithm.updates(),
             fingerprint: self.algorithm.layout().fingerprint(),
         };
@@ -240,17 +260,19 @@ impl<'a> Learner<'a> {
 
     fn send_report(&mut self) {
         self.reported_at = Instant::now();
-        let mut report = std::mem::replace(&mut self.report, empty_report());
-        let n = report.averaged.max(1) as f64;
-        report.critic_loss /= n;
-        report.actor_loss /= n;
-        report.q_mean /= n;
-        report.env_steps = self.counted_rows;
-        report.episodes = self.episodes;
-        report.updates = self.algorithm.updates();
-        report.policy_version = self.policy_version;
+        let losses = std::mem::take(&mut self.losses);
+        let updates = losses.updates.max(1) as f64;
         self.reporter.refresh_connections();
-        self.reporter.send(report);
+        self.reporter.send(LearnerReport {
+            env_steps: self.env_steps,
+            episodes: self.episodes,
+            updates: self.algorithm.updates(),
+            policy_version: self.policy_version,
+            critic_loss: losses.critic_loss / updates,
+            actor_loss: losses.actor_loss / updates,
+            q_mean: losses.q_mean / updates,
+            averaged: losses.updates,
+        });
     }
 
     /// Saves a checkpoint. A free run syncs the replay in the background. A lockstep run flushes it first, because
@@ -272,7 +294,7 @@ impl<'a> Learner<'a> {
         }
         let counters = Counters {
             updates: self.updates(),
-            rows: self.counted_rows,
+            rows: self.env_steps,
             episodes: self.episodes,
             policy_version: self.policy_version,
         };
@@ -295,7 +317,7 @@ impl<'a> Learner<'a> {
         PolicyFile {
             fingerprint: self.algorithm.layout().fingerprint(),
             version: self.policy_version,
-            env_steps: self.counted_rows,
+            env_steps: self.env_steps,
             return_mean: f64::NAN,
             return_std: f64::NAN,
             episodes: 0,
@@ -309,18 +331,25 @@ impl<'a> Learner<'a> {
 }
 
 /// Episodes of the checkpoint that end within the rows that the replay still has. A power loss can take the newest
-/// rows. Their replacements are counted when they arrive. If the ring has overwritten its first rows, the number is
-/// estimated.
+/// rows. Their replacements are counted when they arrive. If the ring has overwritten some of the run's own rows, the
+/// number is estimated.
 fn remaining_episodes(counters: &Counters, replay: &Replay) -> u64 {
-    let head = replay.head();
+    let (initial, head) = (initial_rows(replay), replay.head());
     if head >= counters.rows {
         counters.episodes
-    } else if replay.rows().start == 0 {
-        ended_episodes(replay, 0..head)
+    } else if replay.rows().start <= initial {
+        ended_episodes(replay, initial..head)
     } else {
-        let share = head as f64 / counters.rows as f64;
+        let share = (head - initial) as f64 / (counters.rows - initial) as f64;
         (counters.episodes as f64 * share).round() as u64
     }
+}
+
+/// Rows that the replay began with. Their episodes are not the run's own.
+fn initial_rows(replay: &Replay) -> u64 {
+    let actors = 0..replay.layout().actors;
+    let own: u64 = actors.map(|actor| replay.committed(actor).rows).sum();
+    replay.head().saturating_sub(own)
 }
 
 /// The number of episodes that end within `rows`.
@@ -338,19 +367,6 @@ fn open_intake(domain: &Domain, config: &Config) -> Result<Intake, ChannelError>
     Ok(intake)
 }
 
-fn empty_report() -> LearnerReport {
-    LearnerReport {
-        env_steps: 0,
-        episodes: 0,
-        updates: 0,
-        policy_version: 0,
-        critic_loss: 0.0,
-        actor_loss: 0.0,
-        q_mean: 0.0,
-        averaged: 0,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use shoal_common::transition::{RowLayout, Transition};
@@ -358,8 +374,8 @@ mod tests {
     use super::*;
     use crate::replay::{ChunkId, ReplayLayout};
 
-    /// A replay with this many rows, in episodes of two.
-    fn replay(rows: u64, ring: u64) -> (tempfile::TempDir, Replay) {
+    /// A replay with this many initial rows, and rows of an actor in episodes of two.
+    fn replay(initial: usize, rows: u64, ring: u64) -> (tempfile::TempDir, Replay) {
         let directory = tempfile::tempdir().unwrap();
         let row = RowLayout::new(1, 1);
         let layout = ReplayLayout {
@@ -370,7 +386,7 @@ mod tests {
             fingerprint: 0,
         };
         let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
-        for sequence in 1..=rows {
+        let numbers = |last| {
             let mut numbers = vec![0.0; row.width()];
             let transition = Transition {
                 s: &[0.0],
@@ -378,14 +394,20 @@ mod tests {
                 r: 0.0,
                 discount: 1.0,
                 s_next: &[0.0],
-                last: sequence % 2 == 0,
+                last,
             };
             row.write(&transition, &mut numbers);
+            numbers
+        };
+        if initial > 0 {
+            replay.begin_with_rows(&numbers(true).repeat(initial)).unwrap();
+        }
+        for sequence in 1..=rows {
             let id = ChunkId {
                 incarnation: 0,
                 sequence,
             };
-            replay.append_and_commit(0, id, &numbers).unwrap();
+            replay.append_and_commit(0, id, &numbers(sequence % 2 == 0)).unwrap();
         }
         (directory, replay)
     }
@@ -397,7 +419,7 @@ mod tests {
             episodes,
             ..Counters::default()
         };
-        let (_directory, whole) = replay(10, 100);
+        let (_directory, whole) = replay(0, 10, 100);
         assert_eq!(remaining_episodes(&checkpoint(8, 4), &whole), 4, "no row is missing");
         assert_eq!(remaining_episodes(&checkpoint(10, 5), &whole), 5);
         assert_eq!(
@@ -405,7 +427,19 @@ mod tests {
             5,
             "five rows are missing"
         );
-        let (_directory, wrapped) = replay(10, 4);
+        let (_directory, wrapped) = replay(0, 10, 4);
         assert_eq!(remaining_episodes(&checkpoint(20, 9), &wrapped), 5, "estimated");
+        let (_directory, with_initial) = replay(6, 10, 100);
+        assert_eq!(
+            remaining_episodes(&checkpoint(21, 7), &with_initial),
+            5,
+            "six initial rows"
+        );
+        let (_directory, wrapped) = replay(6, 10, 8);
+        assert_eq!(
+            remaining_episodes(&checkpoint(26, 9), &wrapped),
+            5,
+            "estimated of the actor's rows"
+        );
     }
 }

@@ -9,17 +9,20 @@ use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
 use shoal_common::role::Activity;
 
+use super::error::LearnerError;
 use super::evaluation_wait::EvaluationWait;
 use super::intake::IntakeError;
 use super::learner::Learner;
-use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut evaluation_wait = EvaluationWait::new(learner)?;
     let config = &learner.settings.config;
     let (interval, replay_config) = (config.checkpoint.every_updates, &config.replay);
-    let needed = learner.counted_rows.saturating_sub(config.replay.capacity);
-    if learner.replay.rows().start > needed || learner.replay.head() < learner.counted_rows {
+    // A run without updates saves only its first state, and needs no row again.
+    let repeats_updates = replay_config.updates_per_step > 0.0;
+    let needed = learner.env_steps.saturating_sub(config.replay.capacity);
+    let is_lost = repeats_updates && learner.replay.rows().start > needed;
+    if is_lost || learner.replay.head() < learner.env_steps {
         let path = learner.settings.run.replay_file();
         return Err(LearnerError::RowsLost { path, needed }.into());
     }
@@ -29,14 +32,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     learner.notify_all();
     evaluation_wait.wait(learner, None)?;
     while !learner.has_all_steps() {
-        let (before, updates) = (learner.counted_rows, learner.updates());
+        let (before, updates) = (learner.env_steps, learner.updates());
         let mut rows = before;
         for actor in 0..learner.intake.actor_count() {
             rows = await_chunk(learner, actor, rows)?;
         }
         // Only after all chunks have come: a round that is interrupted before begins again.
         learner.advance_to(rows);
-        while learner.updates() < replay_config.allowed_updates(learner.counted_rows) {
+        while learner.updates() < replay_config.allowed_updates(learner.env_steps) {
             learner.update()?;
             learner.report_activity(Activity::Working);
         }
@@ -56,7 +59,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
 /// Waits until the actor's chunk of this round is in the replay, which begins at row `first`; returns the row after it.
 fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u64, Exit<LearnerError>> {
     loop {
-        if let Some(end) = end_of_chunk(learner, first) {
+        if let Some(end) = end_of_chunk(learner, actor, first) {
             return Ok(end);
         }
         let Learner {
@@ -86,14 +89,17 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
     }
 }
 
-/// The row after the chunk that begins at row `first`, if that chunk is in the replay. A chunk is full, is one episode,
-/// or ends with the last environment step of the run.
-fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
+/// The row after the actor's chunk of this round, which begins at row `first`, if that chunk is in the replay. A chunk is
+/// full, is one episode, or ends with the last environment step of the run.
+fn end_of_chunk(learner: &Learner<'_>, actor: usize, first: u64) -> Option<u64> {
     let Learner { settings, replay, .. } = learner;
     let (config, steps) = (&settings.config, settings.config.run.steps);
     let head = replay.head();
     if head <= first {
-        return (first >= steps).then_some(first);
+        // After the last step no rows are taken, but the chunk is: if the run gets more steps, each actor must have sent
+        // as many chunks as there were rounds.
+        let is_taken = replay.committed(actor).last_chunk.sequence > learner.policy_version;
+        return (first >= steps && is_taken).then_some(first);
     }
     let full = (first + config.chunk_rows() as u64).min(steps);
     if config.algorithm.properties().transition_use == TransitionUse::Episodes {

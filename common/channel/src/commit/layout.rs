@@ -31,7 +31,7 @@ pub(super) const ACTOR_WORDS: usize = 3;
 const MAX_ACTORS: usize = 1 << 16;
 
 /// More words than any actor's snapshot has; a limit for the same reason.
-const MAX_ACTOR_SNAPSHOT_WORDS: usize = 1 << 24;
+pub const MAX_ACTOR_SNAPSHOT_WORDS: usize = 1 << 24;
 
 /// Slots for commit records: two for what is committed (a record of generation g goes to slot g mod 2), then two for
 /// what is known to be on the disk.

@@ -2,6 +2,7 @@
 
 use std::sync::atomic::{Ordering, fence};
 
+use serde::{Deserialize, Serialize};
 use shoal_base::numbers::COUNTER_LIMIT;
 
 use super::layout::{ACTOR_WORDS, RECORD_WORDS, ReplayLayout};
@@ -10,7 +11,7 @@ use super::words::{Words, WritableWords};
 /// Identifies a chunk of one actor. Ids are ordered by incarnation, then by sequence number.
 ///
 /// The default means "none": incarnations and sequence numbers count from 1.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct ChunkId {
     /// Grows with every process that the run starts.
     pub incarnation: u64,
