@@ -47,18 +47,18 @@ impl Endpoint {
         self.protocol == Protocol::Tls
     }
 
-    /// The same endpoint, with a free port if its port is 0. Waits at most `patience` for a port that is taken.
+    /// The same endpoint, with a free port if its port is 0. Waits at most `timeout` for a port that is taken.
     ///
     /// # Errors
     /// When the port stays taken, none is free, or the address is not one of this machine.
-    pub fn with_port(&self, patience: Duration) -> Result<Self, EndpointError> {
+    pub fn with_port(&self, timeout: Duration) -> Result<Self, EndpointError> {
         let failed = |cause: std::io::Error| EndpointError::Port(self.to_string(), cause.to_string());
         let address = format!("{}:{}", self.host, self.port);
         let addresses: Vec<_> = address.to_socket_addrs().map_err(failed)?.collect();
         let begun = Instant::now();
         let listener = loop {
             match TcpListener::bind(&addresses[..]) {
-                Err(cause) if cause.kind() == ErrorKind::AddrInUse && begun.elapsed() < patience => {
+                Err(cause) if cause.kind() == ErrorKind::AddrInUse && begun.elapsed() < timeout => {
                     std::thread::sleep(Duration::from_millis(50));
                 }
                 bound => break bound.map_err(failed)?,

@@ -5,7 +5,7 @@
 mod host;
 mod policies;
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::fmt;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
@@ -37,8 +37,8 @@ use crate::refused;
 use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RunPhase, WireChunk,
-    WireError, WireLease,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, MAX_SNAPSHOT_WORDS, Message, PolicyRequest,
+    ReportNumber, RunPhase, WireChunk, WireError, WireLease,
 };
 
 /// The least and the greatest time between two acknowledgements to a host.
@@ -51,6 +51,9 @@ const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 /// How often the launcher gets the status of the hosts.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
+/// How long the channels of a released host's actors last while the learner has not committed what they hold.
+const RELEASED_TIMEOUT: Duration = Duration::from_secs(10);
+
 /// How long the hosts may take to hand over what they have when the run is over.
 const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -61,7 +64,7 @@ const WARNING_INTERVAL: Duration = Duration::from_secs(10);
 const END_ANNOUNCEMENT: Duration = Duration::from_secs(2);
 
 /// How long hosts may take to find a new gate.
-const CONNECTING: Duration = Duration::from_secs(10);
+const RECONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What the gate needs.
 #[derive(Clone, Debug)]
@@ -118,6 +121,8 @@ enum Arrival {
 /// An actor of another host.
 struct RemoteActor {
     host: u64,
+    /// When its host was released, if it was, and no other has the actor yet.
+    released_at: Option<Instant>,
     /// `None` while the actor that the learner's host had before is ending, and for one that shares a service.
     forwarder: Option<ChunkForwarder>,
     forwarding: Forwarding,
@@ -152,6 +157,8 @@ struct Gate<'a> {
     acknowledgements_sent: u64,
     /// When something wrong was last named.
     warned_at: Option<Instant>,
+    /// The line about the last host that was refused, and when it was written.
+    last_refusal: Option<(Instant, String)>,
     started_at: Instant,
     /// Since when the run is over.
     over_since: Option<Instant>,
@@ -216,6 +223,7 @@ impl<'a> Gate<'a> {
             episodes: Reporter::open(domain)?,
             acknowledgements_sent: 0,
             warned_at: None,
+            last_refusal: None,
             started_at: Instant::now(),
             over_since: None,
             connections_refreshed_at: Instant::now(),
@@ -264,9 +272,9 @@ impl<'a> Gate<'a> {
         // The announcement also reaches a host that reconnects meanwhile.
         let was_announced = since.elapsed() >= END_ANNOUNCEMENT;
         let gone = |host: &Host| host.has_left || (was_announced && host.heard_at.elapsed() >= CUT_OFF_AFTER);
-        // A gate that has just started does not know its hosts before the launcher has answered. Hosts that the launcher
-        // does not know yet need a moment to connect.
-        let knows_all = self.epoch.is_some() && (was_announced || since >= self.started_at + CONNECTING);
+        // A gate that has just started does not know its hosts before the launcher has answered. Hosts that the
+        // launcher does not know yet need a moment to connect.
+        let knows_all = self.epoch.is_some() && (was_announced || since >= self.started_at + RECONNECT_TIMEOUT);
         let has_told_all = knows_all && self.hosts.values().all(gone);
         has_told_all || since.elapsed() >= HAND_OVER_TIMEOUT
     }
@@ -335,7 +343,7 @@ impl<'a> Gate<'a> {
         Ok(chunk.header.rows.into())
     }
 
-    fn handle_report(&mut self, report: HostReport) -> Result<(), GateError> {
+    fn handle_report(&mut self, mut report: HostReport) -> Result<(), GateError> {
         let Some(host) = self.hosts.get_mut(&report.host) else {
             // The empty acknowledgement makes it ask to be admitted.
             return self.acknowledge_nothing(report.host);
@@ -347,16 +355,30 @@ impl<'a> Gate<'a> {
         host.last_report = report.number;
         host.acknowledgement_due = true;
         host.has_left = report.leaving;
+        // A host may lie.
+        let mut known = BTreeSet::new();
+        report.roles.retain(|role| {
+            matches!(role.role, Role::Actor | Role::EnvServer)
+                && host.lease.actors.contains(&role.index)
+                && known.insert((role.role, role.index))
+        });
         for role in &report.roles {
             // The learner then opens the actor's own service.
             let has_own_service = self.settings.config.actors.has_own_service(role.index);
-            if role.role == Role::Actor && has_own_service && host.lease.actors.contains(&role.index) {
+            if role.role == Role::Actor && has_own_service {
                 self.heartbeats.send(role.heartbeat());
             }
         }
-        for episode in &report.episodes {
-            if host.lease.actors.contains(&episode.actor) {
-                self.episodes.send((*episode).into());
+        let (config, rows) = (&self.settings.config, self.replay.rows());
+        for episode in std::mem::take(&mut report.episodes) {
+            let is_possible = host.lease.actors.contains(&episode.actor)
+                && episode.environment < config.actors.envs
+                && episode.steps <= config.spec.time_limit
+                && episode.episode_return.is_finite();
+            if is_possible {
+                let mut episode = EpisodeReport::from(episode);
+                episode.env_steps = episode.env_steps.min(rows);
+                self.episodes.send(episode);
             }
         }
         host.newest_report = Some(report);
@@ -366,7 +388,7 @@ impl<'a> Gate<'a> {
     fn handle_join(&mut self, query: Query) -> Result<(), GateError> {
         let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
         let hello = match Hello::decode(&bytes.unwrap_or_default()) {
-            Ok(hello) => hello.with_plain_name(),
+            Ok(hello) => hello.with_plain_texts(),
             Err(error) => return answer_join(&query, &Admission::Refused(error.to_string())),
         };
         if hello.program != env!("CARGO_PKG_VERSION") {
@@ -375,8 +397,7 @@ impl<'a> Gate<'a> {
                 hello.program,
                 env!("CARGO_PKG_VERSION")
             );
-            tracing::warn!("host {} is refused: {why}", hello.name);
-            return answer_join(&query, &Admission::Refused(why));
+            return self.refuse(&query, &hello.name, why);
         }
         let (theirs, ours) = (&hello.instructions, vector_instructions());
         if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
@@ -384,8 +405,16 @@ impl<'a> Gate<'a> {
                 "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
                  would not have the same bits; join from a host with the same ones"
             );
-            tracing::warn!("host {} is refused: {why}", hello.name);
-            return answer_join(&query, &Admission::Refused(why));
+            return self.refuse(&query, &hello.name, why);
+        }
+        let words = self.replay.layout().actor_snapshot_words;
+        let most = MAX_SNAPSHOT_WORDS.checked_div(words).unwrap_or(usize::MAX);
+        if hello.actors as usize > most {
+            let why = format!(
+                "the snapshots of {} actors are too large for one host: it may have {most}",
+                hello.actors
+            );
+            return self.refuse(&query, &hello.name, why);
         }
         let request = HostRequest {
             host: hello.host,
@@ -399,6 +428,17 @@ impl<'a> Gate<'a> {
             PendingRequest::Join(Box::new(query), hello),
         );
         Ok(())
+    }
+
+    /// Refuses a host. It may ask again every second, so the log repeats a line only after [`WARNING_INTERVAL`].
+    fn refuse(&mut self, query: &Query, name: &str, why: String) -> Result<(), GateError> {
+        let line = format!("host {name} is refused: {why}");
+        let last = self.last_refusal.as_ref();
+        if last.is_none_or(|(then, last)| *last != line || then.elapsed() >= WARNING_INTERVAL) {
+            tracing::warn!("{line}");
+            self.last_refusal = Some((Instant::now(), line));
+        }
+        answer_join(query, &Admission::Refused(why))
     }
 
     fn handle_policy_query(&mut self, query: Query) {
@@ -453,8 +493,7 @@ impl<'a> Gate<'a> {
                         Ok(ControlResponse::Refused(why)) | Err(why) => why,
                         Ok(other) => format!("the launcher gave an unexpected answer: {other:?}"),
                     };
-                    tracing::warn!("host {} is refused: {why}", hello.name);
-                    answer_join(&query, &Admission::Refused(why))?;
+                    self.refuse(&query, &hello.name, why)?;
                 }
                 (Ok(ControlResponse::Leases { epoch, leases }), PendingRequest::Hosts) => {
                     self.epoch = Some(epoch);
@@ -480,17 +519,22 @@ impl<'a> Gate<'a> {
                 return Ok(());
             }
         }
-        let report = self.hosts.get(&lease.host).map_or((0, 0), |host| host.last_report);
+        let report = self
+            .hosts
+            .get(&lease.host)
+            .map_or_else(ReportNumber::default, |host| host.last_report);
         self.release(lease.host);
         let config = &self.settings.config;
-        for actor in &lease.actors {
-            let committed = self.replay.committed(*actor as usize);
-            let remote = RemoteActor {
+        for index in &lease.actors {
+            let committed = self.replay.committed(*index as usize);
+            // What another host has sent may be forwarded and not committed yet: the next chunks follow on that.
+            let actor = self.actors.entry(*index).or_insert_with(|| RemoteActor {
                 host: lease.host,
+                released_at: None,
                 forwarder: None,
                 forwarding: Forwarding::new(committed, config.actors.window),
-            };
-            self.actors.insert(*actor, remote);
+            });
+            (actor.host, actor.released_at) = (lease.host, None);
         }
         let now = Instant::now();
         let host = Host {
@@ -536,7 +580,19 @@ impl<'a> Gate<'a> {
 
     fn release(&mut self, host: u64) {
         self.hosts.remove(&host);
-        self.actors.retain(|_, actor| actor.host != host);
+        for actor in self.actors.values_mut().filter(|actor| actor.host == host) {
+            actor.released_at.get_or_insert_with(Instant::now);
+        }
+        self.forget_released();
+    }
+
+    /// Forgets the actors of released hosts when what was forwarded is committed: a new learner would need the history
+    /// of their channels. After a while it forgets them anyway, because the learner's host may have these actors now.
+    fn forget_released(&mut self) {
+        self.actors.retain(|_, actor| {
+            let may_be_needed = |since: Instant| actor.forwarding.is_waiting() && since.elapsed() < RELEASED_TIMEOUT;
+            actor.released_at.is_none_or(may_be_needed)
+        });
     }
 
     /// Reads what the learner has committed. Returns whether anything has changed.
@@ -586,8 +642,8 @@ impl<'a> Gate<'a> {
                     .map_or(commit.last_chunk, |actor| actor.forwarding.last_forwarded());
                 ActorAcknowledgement {
                     actor: *actor,
-                    committed: (commit.last_chunk.incarnation, commit.last_chunk.sequence),
-                    forwarded: (forwarded.incarnation, forwarded.sequence),
+                    committed: commit.last_chunk,
+                    forwarded,
                     rows: commit.rows,
                     snapshot,
                 }
@@ -627,7 +683,7 @@ impl<'a> Gate<'a> {
                 RunPhase::Running
             },
             rows: self.replay.rows(),
-            report: (0, 0),
+            report: ReportNumber::default(),
             wanted_actors: 0,
             actors: Vec::new(),
         })
@@ -674,6 +730,7 @@ impl<'a> Gate<'a> {
                 "a connection was refused: {why}; only hosts with the run's join.key are let in"
             ));
         }
+        self.forget_released();
         self.policies.refresh()?;
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();

@@ -12,13 +12,13 @@ use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::network::{self, NetworkError, failed};
 use crate::relay::REJOIN_INTERVAL;
-use crate::wire::{Acknowledgement, Admission, Hello, HostReport, Message, RunPhase, WireError};
+use crate::wire::{Acknowledgement, Admission, Hello, HostReport, Message, ReportNumber, RunPhase, WireError};
 
 /// How long the gate may take to answer.
-const ANSWER: Duration = Duration::from_secs(10);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// The pause before the next question to a gate that is not there.
-const PAUSE: Duration = Duration::from_millis(200);
+const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Why a run was not joined.
 #[derive(Debug, thiserror::Error)]
@@ -91,7 +91,14 @@ impl LeaseKeeper {
                 .callback(move |sample| hear(&sample.payload().to_bytes()))
                 .wait();
             let send = |number, leaving| {
-                let report = HostReport::without_processes(host, (0, number), leaving);
+                let report = HostReport::without_processes(
+                    host,
+                    ReportNumber {
+                        relay: 0,
+                        report: number,
+                    },
+                    leaving,
+                );
                 if let Ok(bytes) = report.encode() {
                     // If it is lost, the next one may arrive; without any, the host loses its actors after a while.
                     let _ = connection.0.put(&key, bytes).wait();
@@ -148,7 +155,7 @@ impl Drop for LeaseKeeper {
     }
 }
 
-/// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `patience` is over, or `stop` returns
+/// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `timeout` is over, or `stop` returns
 /// true; also after a refusal, if `ask_again` returns true for its reason. The connection is for a [`LeaseKeeper`].
 ///
 /// # Errors
@@ -157,17 +164,17 @@ pub fn join(
     endpoint: &Endpoint,
     key: Option<&KeyFile>,
     hello: &Hello,
-    patience: Duration,
+    timeout: Duration,
     stop: impl Fn() -> bool,
     ask_again: impl Fn(&str) -> bool,
 ) -> Result<(Admission, GateConnection), JoinError> {
     let session = network::connect(endpoint, key)?;
     let begun = Instant::now();
-    let may_wait = || begun.elapsed() < patience && !stop();
+    let may_wait = || begun.elapsed() < timeout && !stop();
     loop {
         // Without a key nobody knows which run it is, and only one can be there.
         match ask_to_join(&session, key.map_or("*", |key| &key.run_id), hello) {
-            Err(JoinError::Silence { .. }) if may_wait() => std::thread::sleep(PAUSE),
+            Err(JoinError::Silence { .. }) if may_wait() => std::thread::sleep(RETRY_INTERVAL),
             Err(JoinError::Silence { .. }) => {
                 let endpoint = endpoint.to_string();
                 return Err(JoinError::Silence { endpoint });
@@ -187,7 +194,7 @@ pub(crate) fn ask_to_join(session: &Session, run_id: &str, hello: &Hello) -> Res
     let replies = session
         .get(network::join(run_id))
         .payload(hello.encode()?)
-        .timeout(ANSWER)
+        .timeout(ANSWER_TIMEOUT)
         .wait()
         .map_err(failed("ask to be admitted"))?;
     let reply = replies.recv().ok();

@@ -15,7 +15,7 @@ use crate::files::KeyFile;
 pub(crate) const HOST: &str = "shoal host";
 
 /// How long keys are valid.
-pub const VALID: Duration = Duration::from_secs(366 * 24 * 3600);
+pub const VALIDITY: Duration = Duration::from_secs(366 * 24 * 3600);
 
 /// Keys cannot be made.
 #[derive(Debug, thiserror::Error)]

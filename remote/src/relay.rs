@@ -13,7 +13,7 @@ use shoal_common::channel::policy::PolicyPublisher;
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::transitions::ChunkReceiver;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier};
-use shoal_common::commit::{ActorCommit, ChunkId, CommitMirror, ReplayLayout};
+use shoal_common::commit::{ActorCommit, CommitMirror, ReplayLayout};
 use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, Heartbeat};
 use shoal_common::role::{Activity, Role, RoleInstance};
@@ -44,8 +44,9 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(250);
 /// Chunks on their way to the thread that sends them.
 const CHUNK_QUEUE_LENGTH: usize = 64;
 
-/// Episodes kept for the next report; more are dropped while the gate is away.
-const MAX_KEPT_EPISODES: usize = 10_000;
+/// Episodes kept for the next report; more are dropped while the gate is away. The channel to the launcher holds a few
+/// more.
+const MAX_KEPT_EPISODES: usize = 4_000;
 
 /// How long a query for a policy may take, and the pause after one without an answer.
 const POLICY_QUERY_TIMEOUT: Duration = Duration::from_secs(10);
@@ -369,15 +370,14 @@ impl<'a> Relay<'a> {
             let Some(actor) = self.actors.get_mut(&of_actor.actor) else {
                 continue;
             };
-            let id = |(incarnation, sequence)| ChunkId { incarnation, sequence };
             let commit = ActorCommit {
-                last_chunk: id(of_actor.committed),
+                last_chunk: of_actor.committed,
                 rows: of_actor.rows,
             };
             let limit = self.settings.host.limit;
             let follow_up = actor
                 .uncommitted
-                .acknowledge(id(of_actor.forwarded), commit.last_chunk, limit, now);
+                .acknowledge(of_actor.forwarded, commit.last_chunk, limit, now);
             if other_gate {
                 actor.uncommitted.go_back(now);
             }
@@ -522,12 +522,12 @@ impl<'a> Relay<'a> {
     /// Hands chunks to the thread that sends them, as many as it takes. While the gate is away they stay here.
     fn send_chunks(&mut self) {
         let (now, cut_off) = (self.now(), self.is_cut_off());
-        let patience = RESEND_AFTER.max(RESEND_AFTER_ROUND_TRIPS * self.round_trip.unwrap_or_default());
+        let timeout = RESEND_AFTER.max(RESEND_AFTER_ROUND_TRIPS * self.round_trip.unwrap_or_default());
         for actor in self.actors.values_mut() {
             if cut_off {
                 continue;
             }
-            actor.uncommitted.go_back_if_overdue(now, patience);
+            actor.uncommitted.go_back_if_overdue(now, timeout);
             while let Some(kept) = actor.uncommitted.next() {
                 match self.chunk_queue.try_send(kept.chunk.clone()) {
                     Ok(()) => actor.uncommitted.note_sent(),
@@ -554,7 +554,10 @@ impl<'a> Relay<'a> {
     fn send_report(&mut self, leaving: bool) -> Result<(), RelayError> {
         let now = Instant::now();
         self.last_report = (self.last_report.0 + 1, now);
-        let number = (self.settings.instance.incarnation, self.last_report.0);
+        let number = ReportNumber {
+            relay: self.settings.instance.incarnation,
+            report: self.last_report.0,
+        };
         self.unconfirmed_report.get_or_insert((number, now));
         // What is sent while the gate is away is lost.
         let episodes = if self.is_cut_off() {
@@ -607,12 +610,12 @@ impl<'a> Relay<'a> {
 
     /// Waits for an actor or the gate, for a while.
     fn sleep(&self) -> Result<(), RelayError> {
-        let patience = Timespec::try_from(LONGEST_SLEEP).ok();
+        let timeout = Timespec::try_from(LONGEST_SLEEP).ok();
         let mut ready = [
             PollFd::from_borrowed_fd(self.listener.as_fd(), PollFlags::IN),
             PollFd::from_borrowed_fd(self.wake.event.as_fd(), PollFlags::IN),
         ];
-        match poll(&mut ready, patience.as_ref()) {
+        match poll(&mut ready, timeout.as_ref()) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
             Err(errno) => return Err(refused("wait for chunks")(errno)),
         }

@@ -8,7 +8,7 @@ use shoal_common::channel::Domain;
 use shoal_common::channel::control::{self, ControlRequest, ControlResponse, RunDirId};
 
 /// How long the launcher may take.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The thread that asks.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ impl<T: Send + 'static> LauncherRequests<T> {
 
 fn ask(run_id: &str, max_actors: u32, run: RunDirId, request: ControlRequest) -> Result<ControlResponse, String> {
     let domain = Domain::visit(run_id, max_actors).map_err(|error| error.to_string())?;
-    let answer = control::ask(&domain, run, request, PATIENCE, || true);
+    let answer = control::ask(&domain, run, request, TIMEOUT, || true);
     let left = domain.leave();
     let answer = answer.map_err(|error| error.to_string())?;
     left.map_err(|error| error.to_string())?;

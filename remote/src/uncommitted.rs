@@ -170,13 +170,13 @@ impl<C> UncommittedChunks<C> {
         self.chunks.back().is_none_or(|kept| kept.id <= self.forwarded)
     }
 
-    /// Goes back to the first chunk that the gate has not forwarded, if it has forwarded none for `patience` although
+    /// Goes back to the first chunk that the gate has not forwarded, if it has forwarded none for `timeout` although
     /// some were sent.
-    pub fn go_back_if_overdue(&mut self, now: Duration, patience: Duration) {
+    pub fn go_back_if_overdue(&mut self, now: Duration, timeout: Duration) {
         let outstanding = self.next_to_send > 0 && self.chunks[self.next_to_send - 1].id > self.forwarded;
         if !outstanding {
             self.progress_at = now;
-        } else if now.saturating_sub(self.progress_at) >= patience {
+        } else if now.saturating_sub(self.progress_at) >= timeout {
             self.go_back(now);
         }
     }

@@ -191,17 +191,25 @@ pub struct Hello {
     pub held: Vec<u32>,
 }
 
-/// The longest name of a host, in bytes.
+/// The longest name of a host, in bytes, and the longest other text.
 const LONGEST_NAME: usize = 64;
+const LONGEST_TEXT: usize = 256;
 
 impl Hello {
-    /// The same with a name that can be shown on a terminal and fits into messages.
-    pub fn with_plain_name(mut self) -> Self {
-        self.name = self.name.chars().filter(|letter| !letter.is_control()).collect();
-        let end = (0..=LONGEST_NAME).rev().find(|end| self.name.is_char_boundary(*end));
-        self.name.truncate(end.unwrap_or(0));
+    /// The same with texts that can be shown on a terminal and fit into messages.
+    pub fn with_plain_texts(mut self) -> Self {
+        make_plain(&mut self.name, LONGEST_NAME);
+        make_plain(&mut self.program, LONGEST_TEXT);
+        make_plain(&mut self.instructions, LONGEST_TEXT);
         self
     }
+}
+
+/// Removes control characters, and all beyond this number of bytes.
+fn make_plain(text: &mut String, longest: usize) {
+    text.retain(|letter| !letter.is_control());
+    let end = (0..=longest).rev().find(|end| text.is_char_boundary(*end));
+    text.truncate(end.unwrap_or(0));
 }
 
 /// The number of processor cores of this host.
@@ -290,19 +298,24 @@ pub struct Acknowledgement {
 pub struct ActorAcknowledgement {
     /// The actor.
     pub actor: u32,
-    /// Incarnation and sequence number of its last committed chunk.
-    pub committed: (u64, u64),
-    /// Those of the last chunk that the gate has forwarded to the learner.
-    pub forwarded: (u64, u64),
+    /// Its last committed chunk.
+    pub committed: ChunkId,
+    /// The last chunk that the gate has forwarded to the learner.
+    pub forwarded: ChunkId,
     /// Rows of all its committed chunks.
     pub rows: u64,
     /// The actor's snapshot after its last committed chunk, in runs that have snapshots.
     pub snapshot: Vec<u64>,
 }
 
-/// Incarnation of the relay that sends a report, and the number of the report among those of this relay. A host without
-/// a relay has incarnation 0.
-pub type ReportNumber = (u64, u64);
+/// The number of a host's report. Numbers are ordered by relay, then by report.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct ReportNumber {
+    /// The incarnation of the relay that sends the report; 0 if the host has no relay.
+    pub relay: u64,
+    /// Counts the reports of this relay.
+    pub report: u64,
+}
 
 /// What a host tells the gate a few times a second. Some may be lost.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -485,9 +498,15 @@ impl Message for HostReport {
     const KIND: MessageKind = MessageKind::HostReport;
 }
 
-/// The limit keeps a damaged length from allocating memory without bound.
+/// The most bytes that a message decodes to. The limit keeps a damaged length from allocating memory without bound.
+const MAX_MESSAGE_BYTES: usize = 4 << 20;
+
+/// The most words of all snapshots of a host's actors: an acknowledgement has all of them. A word takes 9 bytes at most,
+/// and some room is left for the rest.
+pub const MAX_SNAPSHOT_WORDS: usize = MAX_MESSAGE_BYTES / 10;
+
 fn encoding() -> impl bincode::config::Config {
-    bincode::config::standard().with_limit::<{ 4 << 20 }>()
+    bincode::config::standard().with_limit::<MAX_MESSAGE_BYTES>()
 }
 
 fn sealed(kind: MessageKind, parts: &[&[u8]]) -> Vec<u8> {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::KeyFile;
-use shoal_remote::keys::{self, Keys, VALID};
+use shoal_remote::keys::{self, Keys, VALIDITY};
 use shoal_remote::network::{connect, listen, restart_with_one_thread};
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
@@ -27,7 +27,7 @@ fn endpoint() -> Endpoint {
 }
 
 fn fresh() -> Keys {
-    keys::make(RUN, SystemTime::now() + VALID).unwrap()
+    keys::make(RUN, SystemTime::now() + VALIDITY).unwrap()
 }
 
 /// How often this payload is received with this key.

@@ -14,7 +14,7 @@ use shoal_remote::forwarding::{ChunkOrder, Forwarding};
 use shoal_remote::uncommitted::{ActorFollowUp, UncommittedChunks};
 
 const WINDOW: usize = 3;
-const PATIENCE: Duration = Duration::from_millis(200);
+const TIMEOUT: Duration = Duration::from_millis(200);
 /// No process has such an incarnation.
 const LIMIT: u64 = u64::MAX;
 
@@ -224,8 +224,8 @@ impl World {
                 self.down.remove(which % self.down.len());
             }
             Event::TimePasses => {
-                self.now += PATIENCE / 2;
-                self.relay.go_back_if_overdue(self.now, PATIENCE);
+                self.now += TIMEOUT / 2;
+                self.relay.go_back_if_overdue(self.now, TIMEOUT);
             }
             Event::ActorIsKilled => {
                 self.may_have_lost = true;

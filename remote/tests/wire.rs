@@ -5,10 +5,11 @@
 use proptest::prelude::*;
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
+use shoal_common::commit::ChunkId;
 use shoal_common::role::{Activity, Role};
 use shoal_remote::wire::{
     Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode,
-    RemoteRole, RunPhase, VERSION, WireChunk, WireError, WireLease, WirePolicy,
+    RemoteRole, ReportNumber, RunPhase, VERSION, WireChunk, WireError, WireLease, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -65,12 +66,18 @@ fn acknowledgement() -> Acknowledgement {
         number: 3,
         phase: RunPhase::Running,
         rows: 640,
-        report: (7, 2),
+        report: ReportNumber { relay: 7, report: 2 },
         wanted_actors: 1,
         actors: vec![ActorAcknowledgement {
             actor: 1,
-            committed: (7, 4),
-            forwarded: (7, 5),
+            committed: ChunkId {
+                incarnation: 7,
+                sequence: 4,
+            },
+            forwarded: ChunkId {
+                incarnation: 7,
+                sequence: 5,
+            },
             rows: 256,
             snapshot: vec![1, 300],
         }],
@@ -80,7 +87,7 @@ fn acknowledgement() -> Acknowledgement {
 fn report() -> HostReport {
     HostReport {
         host: 9,
-        number: (7, 3),
+        number: ReportNumber { relay: 7, report: 3 },
         round_trip_us: Some(150),
         leaving: false,
         resent: 1,

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use shoal_run::numbers::parse_small_count;
+use shoal_run::numbers::parse_positive_count;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
@@ -18,7 +18,7 @@ pub(crate) struct JoinArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.
-    #[arg(long, value_name = "N", value_parser = parse_small_count, required_unless_present = "template")]
+    #[arg(long, value_name = "N", value_parser = parse_positive_count, required_unless_present = "template")]
     pub(crate) actors: Option<u32>,
     /// End, with exit code 4, if the run cannot be reached, or does not admit this host again, for this long, as in 90s,
     /// 10min or 2h.

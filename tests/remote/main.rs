@@ -214,6 +214,40 @@ fn scale_changes_the_actors_of_joined_hosts_without_losing_a_row() {
 }
 
 #[test]
+fn what_a_host_sent_before_it_left_outlives_the_learner() {
+    for (actors, setting) in [([1, 2], "actors.max=16"), ([256, 257], "actors.max=258")] {
+        let run = Run::start(&["--actors", "1", "--set", setting]);
+        let host = Host::join(&run, &["--actors", "2"]);
+        wait_for_actors(&run, &actors);
+        let path = run.running.run.clone();
+        run.running.stop_role("learner-0");
+        until("chunks are forwarded and not committed", || {
+            host.sent(&actors) > in_replay(&path, &actors)
+        });
+        host.running.signal(Signal::TERM);
+        until("the host has left", || run.hosts().is_empty());
+        // Another one takes its actors before the learner has committed what the first one sent.
+        let second = (setting != "actors.max=16").then(|| Host::join(&run, &["--actors", "2"]));
+        let sent = host.sent(&actors);
+        assert!(sent > in_replay(&path, &actors));
+        host.ends_with(128 + 15);
+        run.running.kill("learner-0");
+        match second {
+            None => until("all of it is in the replay", || in_replay(&path, &actors) == sent),
+            Some(second) => {
+                wait_for_actors(&run, &actors);
+                let path = stop(run);
+                let sent = sent + second.sent(&actors);
+                second.ends_with(0);
+                assert_eq!(in_replay(&path, &actors), sent);
+                continue;
+            }
+        }
+        stop(run);
+    }
+}
+
+#[test]
 fn actors_that_share_a_service_lose_no_row_when_gate_and_learner_are_killed() {
     // The learner's host can have the first 256 of them.
     let run = Run::start(&[

@@ -16,7 +16,7 @@ use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::{HostFile, JoinFile, KeyFile};
-use shoal_remote::keys::{self, Keys, VALID};
+use shoal_remote::keys::{self, Keys, VALIDITY};
 use shoal_remote::wire::WireLease;
 use shoal_run::child_process::{ChildProcess, role_command};
 use shoal_run::joining::make_host_directory;
@@ -42,7 +42,7 @@ const ANSWER_INTERVAL: Duration = Duration::from_millis(20);
 const PAUSE: Duration = Duration::from_micros(100);
 
 /// How late the loop may be because it has slept.
-const LATE: Duration = Duration::from_millis(1);
+const MAX_LATENESS: Duration = Duration::from_millis(1);
 
 /// What lies between the learner's host and the others.
 #[derive(Debug)]
@@ -172,7 +172,7 @@ impl<'a> RemoteRun<'a> {
         let (config, run) = (&temporary.config, &temporary.run);
         let endpoint = network.endpoint()?;
         JoinFile::new(endpoint.clone(), endpoint.clone()).write(run)?;
-        let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
+        let keys = keys::make(&config.run.id, SystemTime::now() + VALIDITY)?;
         let Keys { gate, join } = &keys;
         gate.write(&run.path().join(KeyFile::GATE))?;
         join.write(&run.path().join(KeyFile::JOIN))?;
@@ -324,7 +324,7 @@ impl<'a> RemoteRun<'a> {
                     continue;
                 }
                 // A full window makes the actor late, a pause of this loop does not.
-                paced.ready_at = paced.ready_at.max(now - LATE.min(self.think)) + self.think;
+                paced.ready_at = paced.ready_at.max(now - MAX_LATENESS.min(self.think)) + self.think;
                 let sender = &mut paced.sender;
                 let numbers = &self.chunks[self.next_chunk];
                 self.next_chunk = (self.next_chunk + 1) % CHUNKS;

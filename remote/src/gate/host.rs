@@ -67,7 +67,7 @@ impl Host {
                 .filter(|(incarnation, _)| *incarnation == role.incarnation)
                 .map_or(0, |(_, steps)| role.steps.saturating_sub(steps));
             roles.push(RoleStatus {
-                role: role.role.name().into(),
+                role: role.role,
                 index: role.index,
                 pid: None,
                 state: if cut_off {

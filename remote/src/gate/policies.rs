@@ -14,7 +14,7 @@ use crate::rate_limiter::RateLimiter;
 use crate::wire::WirePolicy;
 
 /// How long a query for a policy is kept before the host has to ask again.
-const PATIENCE: Duration = Duration::from_secs(8);
+const TIMEOUT: Duration = Duration::from_secs(8);
 
 /// The learner's incarnation and the version of a policy, if there is one.
 pub(super) type PolicyId = Option<(u64, u64)>;
@@ -56,7 +56,7 @@ impl Policies {
     /// Sends the newest policy to the hosts that ask for one and do not have it.
     pub(super) fn send(&mut self, hosts: &mut HashMap<u64, Host>) -> Result<(), GateError> {
         for host in hosts.values_mut() {
-            drop(host.policy_query.take_if(|(.., since)| since.elapsed() >= PATIENCE));
+            drop(host.policy_query.take_if(|(.., since)| since.elapsed() >= TIMEOUT));
         }
         if hosts.values().all(|host| host.policy_query.is_none()) {
             return Ok(());

@@ -46,6 +46,9 @@ impl Supervisor {
                 "a host may have {most} actors at most"
             )));
         }
+        if requested == 0 {
+            return Ok(ControlResponse::Refused("a host has at least one actor".into()));
+        }
         let requested = requested as usize;
         let distinct: HashSet<u32> = held.iter().copied().collect();
         let can_keep = held.len() == requested && distinct.len() == requested;
@@ -68,7 +71,7 @@ impl Supervisor {
             )));
         };
         actors.sort_unstable();
-        let first_incarnation = self.take_incarnations(HostLease::INCARNATIONS)?;
+        let first_incarnation = self.incarnations.take(HostLease::INCARNATIONS)?;
         // The learner opens those of all actors up to the last one that has a service of its own.
         let with_service = actors.iter().filter(|index| **index < self.max_actors_here);
         let end = with_service.max().map_or(0, |last| last + 1);
