@@ -111,10 +111,16 @@ class Policy:
             rows = np.clip(states.reshape(-1).astype(np.int64) - start, 0, len(self._table) - 1)
             return self._table[rows], states.ndim == 0
         inputs = observed(self._observation)
-        x = np.asarray(observations, dtype=np.float32)
-        single = x.ndim <= 1
-        # An observation of any shape is a vector here: a batch has its observations along the first axis.
-        x = x.reshape(1 if single else len(x), -1)
+        if "discrete" in self._observation:
+            # A network sees an index as a number, counted from 0.
+            states = np.asarray(observations)
+            single = states.ndim == 0
+            x = (states.reshape(-1, 1) - int(self._observation["discrete"].get("start", 0))).astype(np.float32)
+        else:
+            x = np.asarray(observations, dtype=np.float32)
+            # An observation of any shape is a vector here: a batch has its observations along the first axis.
+            single = x.ndim <= 1
+            x = x.reshape(1 if single else len(x), -1)
         if x.shape[1] != inputs:
             raise ShoalError(
                 f"an observation has {inputs} numbers, but {x.shape[1]} were given; a batch has shape (n, {inputs})"

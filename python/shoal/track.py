@@ -207,6 +207,9 @@ class Copy:
         """Copies what was added since."""
         self._tracker.settings(dict(flat(self.run.config)))
         for name, prefix in FOLLOWED.items():
+            if not has_header(self.run.path / f"{name}.csv"):
+                # The run starts: its launcher has not made its tables yet.
+                continue
             table = self.run.table(name)
             done = self._lines.get(name, 0)
             self._tracker.metrics(list(rows(table[done:], prefix)))
@@ -248,6 +251,15 @@ class Copy:
             # Before it is renamed: a power loss must not leave an empty file with the final name.
             os.fsync(file.fileno())
         new.replace(self._file)
+
+
+def has_header(path: Path) -> bool:
+    """Whether a table exists and its first line is whole."""
+    try:
+        with path.open("rb") as file:
+            return file.readline().endswith(b"\n")
+    except FileNotFoundError:
+        return False
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

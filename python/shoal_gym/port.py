@@ -23,7 +23,7 @@ BEAT = 0.5
 PROVEN = 1000
 """A server that has taken this many environment steps is able to work: if it fails later, it is started again each time."""
 
-PATIENCE = 10.0
+TIMEOUT = 10.0
 """Seconds for which a port may be refused: a predecessor that was killed has it until the launcher has cleaned up."""
 
 REFUSALS = (
@@ -65,7 +65,7 @@ def claim(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
     is final.
 
     Raises ``Unreachable`` with the refusal."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while True:
         try:
             return attempt()

@@ -38,7 +38,7 @@ class Box:
 
     def number(self, element: Any) -> NDArray[np.float32]:
         """What represents an element in such a view. ``Invalid`` for what is no element."""
-        array = np.asarray(element)
+        array = _array(element)
         if array.shape != self._shape:
             raise Invalid(f"an observation of shape {array.shape}, and its space has shape {self._shape}")
         if array.dtype.kind not in "biuf":
@@ -84,8 +84,8 @@ class Discrete:
 
     def number(self, element: Any) -> int:
         """What represents an element in such a view. ``Invalid`` for what is no element."""
-        array = np.asarray(element)
-        if array.shape != () or array.dtype.kind not in "iuf" or array != np.rint(array):
+        array = _array(element)
+        if array.shape != () or array.dtype.kind not in "iuf" or not np.isfinite(array) or array != np.rint(array):
             raise Invalid(f"the observation {_short(element)}, and its space has integers")
         index = int(array) - self.start
         if not 0 <= index < self.discrete:
@@ -115,10 +115,13 @@ def reward(value: Any) -> float:
     number = value.item() if isinstance(value, np.generic | np.ndarray) and value.ndim == 0 else value
     if not isinstance(number, Real):
         raise Invalid(f"a reward that is {_short(value)} instead of a number")
-    with np.errstate(over="ignore"):
-        finite = bool(np.isfinite(np.float32(number)))
+    try:
+        with np.errstate(over="ignore"):
+            finite = bool(np.isfinite(np.float32(number)))
+    except OverflowError:
+        finite = False
     if not finite:
-        raise Invalid(f"a reward that is {number}, which is not finite as a 32-bit float")
+        raise Invalid(f"a reward that is {_short(number)}, which is not finite as a 32-bit float")
     return float(number)
 
 
@@ -133,6 +136,18 @@ def flag(value: Any, what: str) -> bool:
     raise Invalid(f"{what} that is {_short(value)} instead of a boolean")
 
 
+def _array(element: Any) -> NDArray[Any]:
+    """An observation as an array. ``Invalid`` for what cannot be one, such as lists of different lengths."""
+    try:
+        return np.asarray(element)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise Invalid(f"the observation {_short(element)}, which is no array of numbers") from error
+
+
 def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:
+        # Python writes no integer of more than 4,300 digits.
+        text = f"a long {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -74,6 +74,7 @@ class Given(unittest.TestCase):
         self.refused(with_observation(np.array([0.0, np.nan, 0.0])), "number 1 is nan")
         self.refused(with_observation(np.array([0.0, 0.0, np.inf])), "number 2 is inf")
         self.refused(with_observation(np.array([1e39, 0.0, 0.0])), "number 0 is 1e+39")
+        self.refused(with_observation([[0.0], [0.0, 0.0], 0.0]), "no array of numbers")
         self.refused(with_observation(None), "shape ()")
         self.refused(with_observation(np.array(["a", "b", "c"])), "instead of numbers")
         self.refused(with_observation(np.zeros(3, complex)), "instead of numbers")
@@ -86,6 +87,7 @@ class Given(unittest.TestCase):
             (float("nan"), "nan"),
             (float("inf"), "inf"),
             (1e39, "1e+39"),
+            (10**400, "not finite"),
             (None, "None"),
             ("much", "much"),
             (np.zeros(1), "array"),
@@ -127,6 +129,8 @@ class Given(unittest.TestCase):
         Told.reset_result = (1, {})
         for value, words in [(0, "1 to 4"), (5, "1 to 4"), (2.7, "integers"), (np.array([2]), "integers")]:
             self.refused((value, 0.0, False, False, {}), words)
+        for value in [float("inf"), float("nan"), 10**400]:
+            self.refused((value, 0.0, False, False, {}), "integers")
         environments, blocks = self.make()
         environments.begin_next(blocks)
         Told.step_result = (np.int64(4), 0.0, False, False, {})

@@ -51,6 +51,14 @@ class Files(unittest.TestCase):
         with self.assertRaisesRegex(shoal.ShoalError, "no scores"):
             acting.scores([1.0, 2.0])
 
+    def test_a_network_sees_indices_that_are_counted_from_0(self) -> None:
+        spec = {"observation": {"discrete": {"n": 16, "start": 5}}, "action": SPEC["action"]}
+        # h = max(index, 0), a = 2 tanh(h / 2)
+        path = self.write(policy_file([1.0, 0.0, 0.5, 0.0]))
+        acting = policy.Policy(path, {"spec": spec, "ddpg": {"hidden": [1], "activation": "relu"}})
+        np.testing.assert_allclose(acting(6), [2 * np.tanh(0.5)], rtol=1e-6)
+        np.testing.assert_allclose(acting([5, 7]), [[0.0], [2 * np.tanh(1.0)]], rtol=1e-6)
+
     def test_a_table_and_the_start_of_its_spaces(self) -> None:
         spec = {"observation": {"discrete": {"n": 2, "start": 5}}, "action": {"discrete": {"n": 3, "start": -1}}}
         path = self.write(policy_file([0.0, 2.0, 1.0, 4.0, 4.0, 3.0]))

@@ -62,6 +62,15 @@ class Track(unittest.TestCase):
             (run / file).write_text(text)
         return run
 
+    def test_a_run_whose_tables_are_not_made_yet_has_no_lines(self) -> None:
+        run = self.place / "run"
+        run.mkdir()
+        (run / "config.toml").write_text(FILES["config.toml"])
+        (run / "learner.csv").write_text("wall_sec")
+        track.track(run, "recorder", follow=False)
+        [told] = Recorder.told.values()
+        self.assertEqual(told["metrics"], [])
+
     def test_each_line_is_copied_once_however_often_it_is_called(self) -> None:
         run = self.make("run")
         track.track(run, "recorder")

@@ -26,7 +26,9 @@ fn main() -> ExitCode {
         test!(the_package_passes_its_own_tests, PYTHON),
         test!(a_gymnasium_pendulum_is_trained_while_its_servers_are_killed, PYTHON),
         test!(environments_receive_seeds_and_lockstep_runs_are_repeatable, PYTHON),
+        test!(a_resumed_lockstep_run_begins_other_episodes, PYTHON),
         test!(termination_and_truncation_are_distinguished, PYTHON),
+        test!(episodes_that_never_end_are_named, PYTHON),
         test!(discrete_spaces_with_an_offset_are_learned_by_a_table, PYTHON),
         test!(a_failing_environment_ends_the_run_with_its_last_output, PYTHON),
         test!(
@@ -135,6 +137,49 @@ fn environments_receive_seeds_and_lockstep_runs_are_repeatable() {
     assert_ne!(weights("other", "2"), first);
     let spec = config(&place).spec;
     assert_eq!((spec.observation.width(), spec.action.width()), (4, 2), "flattened");
+}
+
+fn a_resumed_lockstep_run_begins_other_episodes() {
+    let place = place();
+    let steps = ["--lockstep", "--steps", "200", "--set", "environment.after=0"];
+    let running = place.start_in("run", &format!("{OURS}Ends-v0"), &[&SHORT[..], &steps].concat());
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    let output = place.output(&["resume", "run", "--steps", "400"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // Every episode has five steps, and the same reward in each, which depends on its seed.
+    let mut episodes = csv::Reader::from_path(place.path().join("run/episodes.csv")).unwrap();
+    let column = episodes
+        .headers()
+        .unwrap()
+        .iter()
+        .position(|name| name == "return")
+        .unwrap();
+    let mut returns: Vec<String> = episodes.records().map(|row| row.unwrap()[column].to_owned()).collect();
+    let count = returns.len();
+    assert!(count > 50, "{count} episodes");
+    returns.sort();
+    returns.dedup();
+    assert_eq!(returns.len(), count, "some episodes came twice");
+}
+
+fn episodes_that_never_end_are_named() {
+    let place = place();
+    let server = server_of("endless_server", "");
+    for run in ["free", "lockstep"] {
+        let mode = format!("run.mode={run}");
+        let environment = format!("{OURS}Ends-v0");
+        let arguments = [
+            &["train", &environment, "--run", run, "--steps", "20000", "--set", &mode],
+            &SHORT[..],
+            &["--set", "environment.faults=3", "--set", &server],
+        ]
+        .concat();
+        let message = error_line(&place.output(&arguments));
+        assert!(
+            message.contains("environment.faults is 3") && message.contains("after 5 steps (environment 0)"),
+            "{message}"
+        );
+    }
 }
 
 fn termination_and_truncation_are_distinguished() {

@@ -303,6 +303,23 @@ def hostile_server(how):
     return main()
 
 
+def endless_server():
+    """An environment server that never tells the end of an episode."""
+    from shoal_gym import environments
+
+    step = environments.Environments.step
+
+    def endless(self, actions, blocks):
+        step(self, actions, blocks)
+        blocks.terminated[:] = 0
+        blocks.truncated[:] = 0
+
+    environments.Environments.step = endless
+    from shoal_gym.__main__ import main
+
+    return main()
+
+
 def holding_server(episodes):
     """An environment server that creates the file ``held`` and waits for the file ``go`` when it is first asked for other
     evaluation episodes than the first ``episodes``."""

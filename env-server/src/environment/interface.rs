@@ -77,8 +77,9 @@ pub trait Environment: Send {
         None
     }
 
-    /// Draws the current state, for films and the report. `action` is taken in this state or, where it is not known
-    /// yet, led to it; it is empty if there is none. An environment that does not draw itself keeps this default.
+    /// Draws the current state, for films and the report. `action` is the action taken in this state. If that is not
+    /// known yet, it is the action that led here; it is empty if there is none. An environment that does not draw
+    /// itself keeps this default.
     fn draw(&self, _action: &[f64]) -> Option<Drawing> {
         None
     }

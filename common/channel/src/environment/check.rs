@@ -31,6 +31,64 @@ pub enum ResponseFault {
         /// The valid numbers, in words.
         expected: String,
     },
+    /// An episode that is longer than the environment's time limit.
+    #[error(
+        "an environment returned 0 as terminated and truncated after {limit} steps (environment {environment}); expected: 1 \
+         as one of them, because its time limit is {limit}"
+    )]
+    Endless {
+        /// Index of the environment within the server.
+        environment: usize,
+        /// The time limit, in steps.
+        limit: u32,
+    },
+}
+
+/// The lengths of the current episodes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct EpisodeLengths {
+    limit: u32,
+    /// Of each environment: the steps of its episode, and the episodes that it begins after this one. `None` if all its
+    /// episodes are over.
+    current: Vec<Option<(u32, u64)>>,
+}
+
+impl EpisodeLengths {
+    /// Training episodes, one after another without an end.
+    pub(super) fn of_training(environments: usize, limit: u32) -> Self {
+        Self {
+            limit,
+            current: vec![Some((0, u64::MAX)); environments],
+        }
+    }
+
+    /// This number of evaluation episodes, dealt to the environments in turn; 0 means no limit.
+    pub(super) fn of_evaluation(environments: usize, limit: u32, episodes: u32) -> Self {
+        if episodes == 0 {
+            return Self::of_training(environments, limit);
+        }
+        let further = |e: usize| (episodes as usize).checked_sub(e + 1).map(|left| left / environments);
+        Self {
+            limit,
+            current: (0..environments)
+                .map(|e| further(e).map(|left| (0, left as u64)))
+                .collect(),
+        }
+    }
+
+    /// Counts a step of every environment; `ended` tells whether it was the last one of its episode.
+    pub(super) fn count(&mut self, ended: impl Fn(usize) -> bool) -> Result<(), ResponseFault> {
+        let limit = self.limit;
+        for (environment, current) in self.current.iter_mut().enumerate() {
+            *current = match *current {
+                Some((_, left)) if ended(environment) => left.checked_sub(1).map(|left| (0, left)),
+                Some((steps, _)) if steps >= limit => return Err(ResponseFault::Endless { environment, limit }),
+                Some((steps, left)) => Some((steps + 1, left)),
+                None => None,
+            };
+        }
+        Ok(())
+    }
 }
 
 /// Which part of a response is used.
@@ -104,6 +162,42 @@ fn expected(block: Block, observation: &Space) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_episode_beyond_the_time_limit_is_a_fault_unless_the_environment_is_done() {
+        let mut training = EpisodeLengths::of_training(2, 3);
+        for _ in 0..5 {
+            for _ in 0..3 {
+                training.count(|_| false).unwrap();
+            }
+            training.count(|_| true).unwrap();
+        }
+        for _ in 0..3 {
+            training.count(|e| e == 0).unwrap();
+        }
+        let endless = ResponseFault::Endless {
+            environment: 1,
+            limit: 3,
+        };
+        assert_eq!(training.count(|e| e == 0), Err(endless.clone()));
+
+        // Two episodes: the third environment has none.
+        let mut evaluation = EpisodeLengths::of_evaluation(3, 3, 2);
+        evaluation.count(|e| e < 2).unwrap();
+        for _ in 0..10 {
+            evaluation.count(|_| false).unwrap();
+        }
+        // Three episodes: the first environment has two of them.
+        let mut evaluation = EpisodeLengths::of_evaluation(2, 3, 3);
+        evaluation.count(|_| true).unwrap();
+        for _ in 0..3 {
+            evaluation.count(|_| false).unwrap();
+        }
+        assert!(matches!(
+            evaluation.count(|_| false),
+            Err(ResponseFault::Endless { environment: 0, .. })
+        ));
+    }
 
     fn spec(observation: Space) -> EnvironmentSpec {
         EnvironmentSpec {

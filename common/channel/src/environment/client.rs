@@ -1,6 +1,6 @@
 //! The client: an actor or the evaluator asks its environment server for resets and steps.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::time::Instant;
 
 use iceoryx2::identifiers::UniqueServerId;
@@ -14,13 +14,13 @@ use shoal_base::role::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
-use super::check::{ResponseFault, ResponsePart, check_response};
+use super::check::{EpisodeLengths, ResponseFault, ResponsePart, check_response};
 use super::message::{Block, RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus};
 use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{CLAIM_PATIENCE, OpenMode, claim};
+use crate::service::{CLAIM_TIMEOUT, OpenMode, claim};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,6 +71,7 @@ pub struct EnvironmentClient {
     service: EnvironmentService,
     /// The server that runs the current episodes.
     episode_server: Cell<Option<UniqueServerId>>,
+    episode_lengths: RefCell<EpisodeLengths>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
     notifier: Notifier,
@@ -173,6 +174,7 @@ impl EnvironmentClient {
         Ok(Self {
             service,
             episode_server: Cell::new(None),
+            episode_lengths: RefCell::default(),
             client,
             channel,
             notifier,
@@ -220,7 +222,13 @@ impl EnvironmentClient {
                 RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes)
             }
         };
-        self.accept_episodes(self.request_until_answered(listener, header, &[], &mut idle)?)
+        let (environments, limit) = (self.layout.environments, self.spec.time_limit);
+        let lengths = match request {
+            ResetRequest::Evaluation { episodes, .. } => EpisodeLengths::of_evaluation(environments, limit, episodes),
+            ResetRequest::Next | ResetRequest::Training(_) => EpisodeLengths::of_training(environments, limit),
+        };
+        let response = self.request_until_answered(listener, header, &[], &mut idle)?;
+        self.accept_episodes(response, lengths)
     }
 
     /// Every environment takes a step with its action.
@@ -236,9 +244,14 @@ impl EnvironmentClient {
         mut idle: impl FnMut(),
     ) -> Result<StepResult, Exit<ChannelError>> {
         match self.request_within_episodes(listener, RequestKind::Step, actions, &mut idle)? {
-            Some(response) => Ok(StepResult::Taken(
-                self.accept_observations(response, ResponsePart::Step)?,
-            )),
+            Some(response) => {
+                let next = self.accept_observations(response, ResponsePart::Step)?;
+                self.episode_lengths
+                    .borrow_mut()
+                    .count(|e| next.terminated(e) || next.truncated(e))
+                    .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
+                Ok(StepResult::Taken(next))
+            }
             None => Ok(StepResult::Lost),
         }
     }
@@ -281,19 +294,27 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.accept_episodes(self.request_until_answered(
+        let response = self.request_until_answered(
             listener,
             RequestHeader::new(RequestKind::Restore, 0, 0),
             numbers_of(words),
             &mut idle,
-        )?)
+        )?;
+        // How many steps the episodes have is in words that only the server understands.
+        let lengths = EpisodeLengths::of_training(self.layout.environments, self.spec.time_limit);
+        self.accept_episodes(response, lengths)
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
-    fn accept_episodes(&self, response: ServerResponse) -> Result<EnvironmentResponse, Exit<ChannelError>> {
+    fn accept_episodes(
+        &self,
+        response: ServerResponse,
+        lengths: EpisodeLengths,
+    ) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         let server = response.origin();
         let observed = self.accept_observations(response, ResponsePart::Observations)?;
         self.episode_server.set(Some(server));
+        self.episode_lengths.replace(lengths);
         Ok(observed)
     }
 
@@ -376,7 +397,7 @@ impl EnvironmentClient {
             }
             if sent.server.is_none() || sent.is_delivered() {
                 unreachable = None;
-            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_PATIENCE {
+            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_TIMEOUT {
                 return Err(ChannelError::new(&self.channel, "ask", PeerError::NoConnection).into());
             }
         }
