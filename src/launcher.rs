@@ -55,20 +55,20 @@ const SHORTEST_TICK: Duration = Duration::from_millis(20);
 const LOW_FILL: f64 = 0.1;
 
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
-const LAST_EVALUATION_REPORT: Duration = Duration::from_secs(1);
+const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How long actors of a run that is stopped wait until everything is committed, even while there is no learner.
-const ACTORS_HAND_OVER: Duration = Duration::from_secs(2);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long actors may take to end after that. In a run that was not stopped, this is all the time they have.
-const ACTORS_END: Duration = Duration::from_secs(3);
+const ACTORS_END_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long the other roles may take to end. The learner saves its state in this time.
-const OTHERS_END: Duration = Duration::from_secs(15);
+const OTHERS_END_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// How long the gate may take to let the other hosts hand over their last chunks.
-const GATE_END: Duration = Duration::from_secs(8);
+const GATE_END_TIMEOUT: Duration = Duration::from_secs(8);
 
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
-const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
+const PREDECESSORS_TIMEOUT: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
 /// How often the run may get new shared memory within an hour.
 const MAX_RENEWALS: usize = 5;
@@ -147,7 +147,7 @@ pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Re
         // For `shoal status`, which nobody answers until there is a launcher.
         outcome.with_reason(OutcomeReason::Starting).write(run)?;
     }
-    let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END);
+    let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_TIMEOUT);
     waited
         .map_err(|error| name_original_run(error, run))
         .inspect_err(|error| record_failed_start(run, error))
@@ -165,7 +165,7 @@ pub(crate) fn wait_for_roles_here(run_id: &str, run: &RunDir) -> anyhow::Result<
         Ok(()) => return Ok(()),
         Err(_) => {}
     }
-    match Domain::wait_for_earlier_processes(run_id, PREDECESSORS_END) {
+    match Domain::wait_for_earlier_processes(run_id, PREDECESSORS_TIMEOUT) {
         Err(error) if !is_another(&error) => Err(error.into()),
         _ => Ok(()),
     }
@@ -277,7 +277,8 @@ enum Phase {
     AtWork,
     /// It ends the roles, and the run with them. The other hosts end too.
     RunEnds,
-    /// It ends the roles, but the other hosts wait: the run has failed, moves to new shared memory, or is to be resumed.
+    /// It ends the roles, but the other hosts wait: the run has failed, moves to new shared memory, or is to be
+    /// resumed.
     RolesEnd,
 }
 
@@ -300,6 +301,7 @@ struct Launcher<'a> {
     stalls: StallDetector,
     started_at: Instant,
     tick: Duration,
+    longest_tick: Duration,
     heartbeats: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
     evaluation_reports: Reports<EvaluationReport>,
@@ -324,6 +326,9 @@ impl<'a> Launcher<'a> {
         if config.evaluation.keep_policies {
             std::fs::create_dir_all(run.policies()).context("cannot create the directory for policies")?;
         }
+        // An actor may report more episodes at once than its channel holds.
+        let many_reports = config.chunk_rows() > EpisodeReport::BUFFER;
+        let longest_tick = if many_reports { SHORTEST_TICK } else { TICK };
         let mut recorder = Recorder::open(run, &config.replay)?;
         recorder.settings(&config)?;
         let initial = status::saved_status(&config, run)?;
@@ -351,6 +356,7 @@ impl<'a> Launcher<'a> {
             signals,
             started_at: Instant::now(),
             tick: SHORTEST_TICK,
+            longest_tick,
         })
     }
 
@@ -493,7 +499,7 @@ impl<'a> Launcher<'a> {
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
         let last = status::saved_status(&self.config, self.run)?.env_steps;
         let begun = Instant::now();
-        while begun.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
+        while begun.elapsed() < LAST_EVALUATION_TIMEOUT && self.signals.received().is_none() {
             self.read_reports()?;
             self.answer_requests()?;
             let period = |steps| self.config.evaluation.period(steps);
@@ -519,10 +525,10 @@ impl<'a> Launcher<'a> {
         // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
         if was_asked && self.config.run.mode == Mode::Free {
             self.supervisor.ask_to_retire(Role::Actor);
-            self.have_ended_within(ACTORS_HAND_OVER, |role| role == Role::Actor, receiver);
+            self.have_ended_within(HAND_OVER_TIMEOUT, |role| role == Role::Actor, receiver);
         }
         self.supervisor.ask_to_end(|role| role == Role::Actor);
-        self.await_end(|role| role == Role::Actor, ACTORS_END, receiver);
+        self.await_end(|role| role == Role::Actor, ACTORS_END_TIMEOUT, receiver);
         self.take_signal();
         let is_over = |end_request: Option<EndRequest<RunEnd>>| match ending {
             Some(RolesEnd::Renewal) => end_request.is_some_and(|request| request.end.ends_hosts(hosts_wait)),
@@ -533,7 +539,7 @@ impl<'a> Launcher<'a> {
         // They hand over what they have while the learner is still there.
         let mut told = if are_told { self.tell_hosts(receiver) } else { Ok(()) };
         self.supervisor.ask_to_end(|_| true);
-        self.await_end(|_| true, OTHERS_END, None);
+        self.await_end(|_| true, OTHERS_END_TIMEOUT, None);
         self.take_signal();
         if !are_told && is_over(self.end_request) {
             told = self.tell_hosts(None);
@@ -546,7 +552,7 @@ impl<'a> Launcher<'a> {
     /// Tells the other hosts that the run is over. A gate that has just died, or dies meanwhile, is started again for
     /// that.
     fn tell_hosts(&mut self, receiver: Option<Role>) -> anyhow::Result<()> {
-        let deadline = Instant::now() + GATE_END;
+        let deadline = Instant::now() + GATE_END_TIMEOUT;
         self.supervisor.ensure_gate(self.domain)?;
         loop {
             self.supervisor.ask_to_retire(Role::Gate);
@@ -585,9 +591,10 @@ impl<'a> Launcher<'a> {
             })?,
         ];
         self.tick = match fills.into_iter().fold(0.0, f64::max) {
-            0.0..=LOW_FILL => (self.tick * 3 / 2).min(TICK),
-            fill => self.tick.mul_f64(LOW_FILL / fill).max(SHORTEST_TICK),
-        };
+            0.0..=LOW_FILL => self.tick * 3 / 2,
+            fill => self.tick.mul_f64(LOW_FILL / fill),
+        }
+        .clamp(SHORTEST_TICK, self.longest_tick);
         Ok(())
     }
 }

@@ -51,15 +51,34 @@ fn main() -> ExitCode {
     })
 }
 
-/// Prints what is wrong with the arguments, or what `--help` and `--version` ask for. For a refused value, the first
-/// line says enough.
+/// Says in one line what is wrong with the arguments, or prints what `--help` and `--version` ask for.
 fn wrong_usage(error: &clap::Error) -> ExitCode {
-    if error.kind() != ErrorKind::ValueValidation {
+    if !error.use_stderr() || error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand {
         error.exit();
     }
-    let text = error.to_string();
-    say(text.lines().next().unwrap_or_default());
+    say(in_one_line(&error.to_string()));
     WRONG_USAGE.into()
+}
+
+/// A message of clap without the usage of the command: what is wrong, and what was probably meant.
+fn in_one_line(message: &str) -> String {
+    let is_about_usage = |line: &&str| line.starts_with("Usage:") || line.starts_with("For more information");
+    let mut text = String::new();
+    for line in message.lines().map(str::trim).take_while(|line| !is_about_usage(line)) {
+        if line.is_empty() {
+            continue;
+        }
+        if !text.is_empty() {
+            // A list, or what the line before announces.
+            text += if text.ends_with(':') || line.starts_with('[') {
+                " "
+            } else {
+                "; "
+            };
+        }
+        text += line;
+    }
+    text
 }
 
 fn run(command: &Command) -> anyhow::Result<ExitCode> {
@@ -113,4 +132,42 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
 
 fn done((): ()) -> ExitCode {
     ExitCode::SUCCESS
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::{Cli, in_one_line};
+
+    #[test]
+    fn wrong_arguments_are_one_line_with_what_was_probably_meant() {
+        for (arguments, parts) in [
+            (
+                &["train", "pendulum", "--actor", "2"][..],
+                &["'--actor'", "'--actors'"][..],
+            ),
+            (&["train", "pendulum", "--steps", "many"], &["'many'", "--steps"]),
+            (
+                &["eval", "run", "--policy", "worst"],
+                &["'worst'", "[possible values: best, last]"],
+            ),
+            (&["trian"], &["'trian'", "'train'"]),
+            (&["stop"], &["not provided: <RUN>"]),
+            (
+                &["export", "run"],
+                &["not provided: <--format <FORMAT>|--minari <DATASET>>"],
+            ),
+        ] {
+            let error = Cli::try_parse_from([&["shoal"], arguments].concat()).unwrap_err();
+            let line = in_one_line(&error.to_string());
+            assert!(
+                line.starts_with("error: ") && !line.contains('\n') && !line.contains("Usage"),
+                "{line}"
+            );
+            for part in parts {
+                assert!(line.contains(part), "{line}");
+            }
+        }
+    }
 }

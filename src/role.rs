@@ -162,7 +162,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> 
         } else {
             incarnation
         },
-        surroundings: LaunchContext::of_run(run, config)?,
+        launch_context: LaunchContext::of_run(run, config)?,
         pictures: None,
         description: None,
     })

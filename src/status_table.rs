@@ -28,7 +28,7 @@ pub(crate) const ROLE_COLUMNS: [&str; 7] = ["role", "pid", "state", "restarts", 
 pub(crate) fn role_cells(role: &RoleStatus) -> [String; 7] {
     let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
     [
-        format!("{} {}", role.role, role.index),
+        format!("{} {}", role.role.name(), role.index),
         role.pid.map_or_else(String::new, |pid| pid.to_string()),
         state_name(role.state).into(),
         role.restarts.to_string(),

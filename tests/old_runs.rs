@@ -166,9 +166,12 @@ fn is_read(place: &Workplace, playable: bool) {
 
     for policy in ["best", "last"] {
         let export = |form| {
-            let arguments = ["export", "run", "--policy", policy, "--out", "policy", "--format", form];
-            printed(place, &arguments);
-            std::fs::read(place.path().join("policy")).unwrap()
+            let out = format!("policy.{form}");
+            printed(
+                place,
+                &["export", "run", "--policy", policy, "--out", &out, "--format", form],
+            );
+            std::fs::read(place.path().join(&out)).unwrap()
         };
         Model::load(export("onnx")).unwrap();
         assert!(!SafeTensors::deserialize(&export("safetensors")).unwrap().is_empty());

@@ -102,7 +102,7 @@ fn everything_in(directory: &Path) -> Vec<PathBuf> {
 }
 
 fn is_private(path: &Path) -> bool {
-    // A file may wait_until_gone in between.
+    // A file may be removed in between.
     fs::symlink_metadata(path).is_ok_and(|metadata| metadata.mode() & 0o077 == 0) || !path.exists()
 }
 

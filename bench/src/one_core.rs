@@ -18,7 +18,7 @@ use super::rows::ENVIRONMENTS;
 use super::temporary_run::{TemporaryRun, settings_for_counting};
 
 /// Length of a turn of the actor and its server. A turn of the policy alone takes half as long.
-const TURN: Duration = Duration::from_millis(200);
+const TURN_LENGTH: Duration = Duration::from_millis(200);
 
 /// Target of the share.
 pub(super) const TARGET: f64 = 0.8;
@@ -48,8 +48,8 @@ pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<O
     };
     temporary.with_processes(cores_for, |domain, processes| {
         let mut progress = RunProgress::begin(&temporary, domain, processes, budget)?;
-        let turns = intervals::count(length, 1.0, TURN.mul_f64(1.5));
-        let turn = TURN.min(length.div_f64(1.5));
+        let turns = intervals::count(length, 1.0, TURN_LENGTH.mul_f64(1.5));
+        let turn = TURN_LENGTH.min(length.div_f64(1.5));
         take_turns(&mut progress, processes, &cores, turns, turn, &mut inference, budget)
     })
 }

@@ -18,7 +18,7 @@ use shoal_learner::networks::product::{Product, Transposed};
 use super::intervals;
 
 /// Length of an attempt. It is shorter than a time slice, so that most attempts are undisturbed.
-const ATTEMPT: Duration = Duration::from_millis(2);
+const ATTEMPT_LENGTH: Duration = Duration::from_millis(2);
 
 /// With a dimension of at most this, nalgebra 0.35 does not use matrixmultiply but `axcpy`. For a vector with a stride,
 /// that takes the length of its storage for the vector's, and writes beyond the result.
@@ -85,7 +85,7 @@ impl TimedProduct {
         let mut chosen = self.kernel;
         for &kernel in self.kernels() {
             self.kernel = kernel;
-            let rate = self.gflops(ATTEMPT);
+            let rate = self.gflops(ATTEMPT_LENGTH);
             if rate > self.best {
                 (self.best, chosen) = (rate, kernel);
             }

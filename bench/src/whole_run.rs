@@ -59,7 +59,7 @@ struct Spread {
 
 #[derive(Serialize)]
 struct RoleMemory {
-    role: String,
+    role: &'static str,
     index: u32,
     #[serde(flatten)]
     memory: Memory,
@@ -100,13 +100,13 @@ fn recoveries_and_memory(
         if recoveries.is_empty() {
             for (role, index, pid) in &processes {
                 roles.push(RoleMemory {
-                    role: role.clone(),
+                    role: role.name(),
                     index: *index,
                     memory: Memory::of(*pid, &training.replay()?)?,
                 });
             }
         }
-        let learner = processes.iter().find(|(role, ..)| role == Role::Learner.name());
+        let learner = processes.iter().find(|(role, ..)| *role == Role::Learner);
         let pid = learner.and_then(|(.., pid)| Pid::from_raw(*pid as i32));
         let pid = pid.context("the run has no learner to kill")?;
         let killed = Instant::now();

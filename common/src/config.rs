@@ -40,7 +40,7 @@ pub use crate::algorithms::*;
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// The run itself: id, seed, mode, length, origin, and patience with its processes.
+    /// The run itself: id, seed, mode, length, origin, and when its processes are stalled.
     pub run: RunConfig,
     /// The environment.
     pub environment: EnvironmentConfig,

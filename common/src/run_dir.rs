@@ -72,8 +72,8 @@ fn suite(path: &Path) -> String {
     let Some(first) = runs.first() else {
         return format!("it is a suite, and none of its runs has begun: shoal resume {here}");
     };
-    let shown = runs.iter().take(SHOWN).cloned().collect::<Vec<_>>().join(", ");
-    let others = match runs.len().saturating_sub(SHOWN) {
+    let shown = runs.iter().take(MAX_NAMED_RUNS).cloned().collect::<Vec<_>>().join(", ");
+    let others = match runs.len().saturating_sub(MAX_NAMED_RUNS) {
         0 => String::new(),
         others => format!(", and {others} more, which `shoal list {here}` shows"),
     };
@@ -85,7 +85,7 @@ fn suite(path: &Path) -> String {
 }
 
 /// At most this many runs of a suite are named in an error.
-const SHOWN: usize = 3;
+const MAX_NAMED_RUNS: usize = 3;
 
 /// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
 fn did_you_mean(path: &Path) -> String {
@@ -119,7 +119,7 @@ fn id_of(directory: &std::fs::Metadata) -> RunDirId {
 }
 
 /// How long `config.toml` may be missing: some editors rename the old file before they write the new one.
-const EDITING: Duration = Duration::from_millis(300);
+const EDITOR_RENAME_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// A run that this process has locked. The launcher keeps it locked while the run is running; the system releases the
 /// lock when the launcher dies.
@@ -170,7 +170,7 @@ impl LockedRun {
             if !matches!(run.config_file().try_exists(), Ok(false)) {
                 return Ok(());
             }
-            if since.elapsed() >= EDITING {
+            if since.elapsed() >= EDITOR_RENAME_TIMEOUT {
                 break;
             }
             std::thread::sleep(Duration::from_millis(10));

@@ -337,6 +337,13 @@ mod tests_support {
         (config, policy)
     }
 
+    /// A task whose environment numbers its observations from 5, and a policy network for it.
+    pub(super) fn with_observed_indices() -> (Config, PolicyFile) {
+        let mut config = with_defaults("ddpg");
+        config.spec.observation = Space::Discrete { n: 16, start: 5 };
+        with_policy(config)
+    }
+
     /// `count` observations of the environment, concatenated.
     pub(super) fn some_observations(config: &Config, count: usize) -> Vec<f32> {
         match config.spec.observation {

@@ -160,8 +160,9 @@ pub fn film(
                     Space::Box { .. } => STEPS_PER_SECOND,
                 });
             let steps = trajectory.actions.len();
-            let images = images(&frames, request.height)?;
-            let size = (images[0].width, images[0].height);
+            let mut pictures = Pictures::new(&frames, request.height);
+            let first = pictures.get(0)?;
+            let size = (first.width, first.height);
             let writer = match &mut writer {
                 Some(writer) => writer,
                 None => {
@@ -169,7 +170,7 @@ pub fn film(
                     writer.insert(Writer::new(file, format, size, rate)?)
                 }
             };
-            shown.seconds += writer.add(&images, frames.stride, steps, rate, interrupt)?;
+            shown.seconds += writer.add(&mut pictures, steps, rate, interrupt)?;
             shown.episodes.push((trajectory.episode_return(), steps));
         }
         Ok(writer.context("there is no episode")?.finish(interrupt)?)
@@ -184,21 +185,61 @@ pub fn film(
     Ok(shown)
 }
 
-/// The pictures in pixels, all of one size.
-fn images<'a>(frames: &'a Frames, height: u32) -> anyhow::Result<Vec<Cow<'a, Image>>> {
-    let mut painter = Painter::new(height);
-    let image = |frame: &'a Frame| match frame {
-        Frame::Image(image) => Some(Cow::Borrowed(image)),
-        Frame::Drawing(drawing) => painter.paint(drawing).map(Cow::Owned),
-    };
-    let images: Option<Vec<_>> = frames.frames.iter().map(image).collect();
-    let images = images
-        .filter(|images| !images.is_empty())
-        .context("the environment's drawing has no size")?;
-    let size = |image: &Image| (image.width, image.height);
-    let one = images.iter().all(|image| size(image) == size(&images[0]));
-    ensure!(one, "the environment's pictures change their size");
-    Ok(images)
+/// The pictures of an episode in pixels, all of one size. They are painted one after another: all of them may be larger
+/// than the memory.
+struct Pictures<'a> {
+    frames: &'a Frames,
+    painter: Painter,
+    size: Option<(usize, usize)>,
+    /// The picture that was asked for last, and its number.
+    last: Option<(usize, Cow<'a, Image>)>,
+    /// Drawings that the painter knows: each adds to the trail.
+    drawn: usize,
+}
+
+impl<'a> Pictures<'a> {
+    fn new(frames: &'a Frames, height: u32) -> Self {
+        Self {
+            frames,
+            painter: Painter::new(height),
+            size: None,
+            last: None,
+            drawn: 0,
+        }
+    }
+
+    fn len(&self) -> usize {
+        self.frames.frames.len()
+    }
+
+    /// The picture with this number, which is not before the one that was asked for last.
+    ///
+    /// # Errors
+    /// When it has no size, or another one than those before.
+    fn get(&mut self, number: usize) -> anyhow::Result<&Image> {
+        let image = match self.last.take() {
+            Some((last, image)) if last == number => image,
+            _ => {
+                for frame in self.frames.frames.iter().take(number).skip(self.drawn) {
+                    if let Frame::Drawing(drawing) = frame {
+                        self.painter.leave_out(drawing);
+                    }
+                }
+                self.drawn = number + 1;
+                let image = match self.frames.frames.get(number) {
+                    Some(Frame::Image(image)) => Some(Cow::Borrowed(image)),
+                    Some(Frame::Drawing(drawing)) => self.painter.paint(drawing).map(Cow::Owned),
+                    None => None,
+                };
+                image.context("the environment's drawing has no size")?
+            }
+        };
+        let size = (image.width, image.height);
+        let first = *self.size.get_or_insert(size);
+        ensure!(size == first, "the environment's pictures change their size");
+        let (_, image) = self.last.insert((number, image));
+        Ok(image)
+    }
 }
 
 /// Writes pictures in either format.
@@ -229,18 +270,17 @@ impl<'a, W: Write> Writer<'a, W> {
         Ok(Self { size, left_over, to })
     }
 
-    /// Adds the pictures of an episode that are `stride` steps apart, and returns how long they are shown, in s.
+    /// Adds the pictures of an episode, and returns how long they are shown, in s.
     fn add(
         &mut self,
-        images: &[Cow<'_, Image>],
-        stride: usize,
+        pictures: &mut Pictures<'_>,
         steps: usize,
         rate: f64,
         interrupt: &Interrupt,
     ) -> anyhow::Result<f64> {
-        let size = (images[0].width, images[0].height);
-        ensure!(size == self.size, "the environment's pictures change their size");
-        let last = images.len() - 1;
+        // That of the episodes before.
+        pictures.size = Some(self.size);
+        let (stride, last) = (pictures.frames.stride, pictures.len() - 1);
         match &mut self.to {
             To::Gif(animation) => {
                 let every = (SHORTEST_DELAY * rate / 100.0 / stride as f64).ceil().max(1.0) as usize;
@@ -255,20 +295,20 @@ impl<'a, W: Write> Writer<'a, W> {
                     let exact = 100.0 * lasts + self.left_over;
                     let delay = exact.round().clamp(SHORTEST_DELAY, f64::from(u16::MAX));
                     self.left_over = (exact - delay).clamp(-SHORTEST_DELAY, SHORTEST_DELAY);
-                    animation.add(&images[*i], delay as u16)?;
+                    animation.add(pictures.get(*i)?, delay as u16)?;
                     seconds += delay / 100.0;
                 }
                 Ok(seconds)
             }
             To::Mp4 { ffmpeg, fps, .. } => {
-                let pictures = ((steps as f64 / rate + PAUSE) * *fps).round().max(1.0) as usize;
-                for n in 0..pictures {
+                let count = ((steps as f64 / rate + PAUSE) * *fps).round().max(1.0) as usize;
+                for n in 0..count {
                     check(interrupt)?;
                     let step = (n as f64 / *fps * rate + 1e-6) as usize;
                     let i = if step >= steps { last } else { (step / stride).min(last) };
-                    ffmpeg.add(&images[i], interrupt)?;
+                    ffmpeg.add(pictures.get(i)?, interrupt)?;
                 }
-                Ok(pictures as f64 / *fps)
+                Ok(count as f64 / *fps)
             }
         }
     }

@@ -2,13 +2,18 @@
 
 use std::collections::BTreeMap;
 
+use anyhow::ensure;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
+use shoal_run::evaluation::best_policy::evaluate_and_keep_best;
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{SavedPolicy, evaluate};
 use shoal_run::records::recorder::{EpisodeRecord, read_episodes, read_evaluations};
+use shoal_run::signals::Interrupt;
+use shoal_run::status::saved_status;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
@@ -46,10 +51,20 @@ impl Policies {
     /// per chunk, so that every episode has its own policy version. If a run is interrupted before the learner uses a
     /// chunk, its episode is collected and recorded again; such duplicates are removed, and so are episodes beyond the
     /// run's end.
+    ///
+    /// # Errors
+    /// When they cannot be read, or some are missing.
     pub(super) fn episodes(&self) -> anyhow::Result<Vec<EpisodeRecord>> {
         let mut episodes = read_episodes(&self.run.episodes())?;
         episodes.dedup_by_key(|episode| episode.policy_version);
         episodes.truncate(self.config.run.episodes.unwrap_or(u64::MAX) as usize);
+        let (recorded, ended) = (episodes.len() as u64, saved_status(&self.config, &self.run)?.episodes);
+        ensure!(
+            recorded >= ended.min(self.config.run.episodes.unwrap_or(u64::MAX)),
+            "{}: episodes.csv has {recorded} of {ended} episodes, because a launcher was killed: remove this directory, and \
+             repeat the command",
+            self.run.path().display()
+        );
         Ok(episodes)
     }
 }
@@ -109,6 +124,11 @@ fn store_result<F: Family>(
     let config = run.config()?;
     // The result's header states the settings of the run itself, so they must be the expected ones.
     RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
+    let steps = saved_status(&config, &run)?.env_steps;
+    if FinalEvaluation::read(&run, steps)?.is_none() {
+        // It was interrupted.
+        evaluate_and_keep_best(&config, &run.lock()?, steps, &Interrupt::default(), |_, _| ())?;
+    }
     let policies = Policies {
         best: SavedPolicy::Best.read(&run, &config)?,
         last: SavedPolicy::Last.read(&run, &config)?,

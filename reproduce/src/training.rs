@@ -90,9 +90,11 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
         return Ok(false);
     };
     let steps = last.env_steps;
+    // The last policy is also written when a signal ends the run at its last step, before it is evaluated.
+    let finished = status::saved_status(&run.config()?, &run)?.finished;
     Ok(match length {
-        Length::Steps(wanted) => steps >= wanted,
-        Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps,
+        Length::Steps(wanted) => steps > wanted || (steps == wanted && finished),
+        Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps && finished,
     })
 }
 

@@ -13,16 +13,16 @@ use crate::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use crate::status::saved_status;
 
 /// How long a launcher may take to answer. One that is starting, or writes to a busy disk, does not answer at once.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// How long it may take to change the number of actors: it writes the change to the disk, in several files.
-const SCALE_PATIENCE: Duration = Duration::from_secs(60);
+const SCALE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How long a run may take to end. Its roles are given less.
-const STOP_PATIENCE: Duration = Duration::from_secs(120);
+const STOP_TIMEOUT: Duration = Duration::from_secs(120);
 
 /// How long the launcher of a stopped run may take to draw its figures.
-const FIGURES_PATIENCE: Duration = Duration::from_secs(60);
+const FIGURES_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A run, whose launcher is asked if it has one.
 #[derive(Debug)]
@@ -42,12 +42,12 @@ impl RunClient {
     }
 
     /// Asks the run's launcher; `None` if there is none, or it ends before it answers.
-    fn ask(&self, request: ControlRequest, patience: Duration) -> anyhow::Result<Option<ControlResponse>> {
+    fn ask(&self, request: ControlRequest, timeout: Duration) -> anyhow::Result<Option<ControlResponse>> {
         if !self.run.is_running()? {
             return Ok(None);
         }
         let domain = Domain::visit(&self.config.run.id, self.config.actors.max_on_a_host())?;
-        let answer = self.ask_in(&domain, request, patience);
+        let answer = self.ask_in(&domain, request, timeout);
         let left = domain.leave();
         let answer = answer?;
         left?;
@@ -58,7 +58,7 @@ impl RunClient {
         &self,
         domain: &Domain,
         request: ControlRequest,
-        patience: Duration,
+        timeout: Duration,
     ) -> anyhow::Result<Option<ControlResponse>> {
         let _sweeper = Sweeper::start(domain)?;
         let is_about_status = request == ControlRequest::Status;
@@ -68,7 +68,7 @@ impl RunClient {
             !is_about_status && reason.is_ok_and(|reason| reason == Some(OutcomeReason::FinalEvaluation))
         };
         let lives = || self.run.is_running().unwrap_or(true) && !is_too_late();
-        match control::ask(domain, self.run.directory_id()?, request, patience, lives) {
+        match control::ask(domain, self.run.directory_id()?, request, timeout, lives) {
             Ok(ControlResponse::AnotherRun(there)) => {
                 let here = self.run.path().display();
                 bail!("{here} is a copy of {there}, which is running; the launcher in {here} waits for it to end")
@@ -132,7 +132,7 @@ impl RunClient {
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
         // A launcher that fails while it starts removes its shared memory, and this request with it.
         let starts = self.reason_for_no_roles()? == Some(OutcomeReason::Starting);
-        let answer = match self.ask(ControlRequest::Status, PATIENCE) {
+        let answer = match self.ask(ControlRequest::Status, TIMEOUT) {
             Err(_) if starts => Some(ControlResponse::Status(
                 self.saved(OutcomeReason::Starting.to_string())?,
             )),
@@ -147,7 +147,7 @@ impl RunClient {
 
     /// Changes the number of actors. Returns that of this host, which is the learner's, and that of all hosts together.
     pub fn scale(&self, request: ScaleRequest) -> anyhow::Result<(u32, u32)> {
-        match self.ask(ControlRequest::Scale(request), SCALE_PATIENCE)? {
+        match self.ask(ControlRequest::Scale(request), SCALE_TIMEOUT)? {
             None => bail!("{}", self.not_running()),
             Some(ControlResponse::Scaled { here, total }) => Ok((here, total)),
             Some(answer) => Err(not_accepted(answer)),
@@ -162,10 +162,10 @@ impl RunClient {
             Some(status) if is_in_final_evaluation(&status) => bail!("{}", in_final_evaluation(&self.run)),
             Some(_) => {}
         }
-        let answer = self.ask(ControlRequest::Stop, STOP_PATIENCE)?;
+        let answer = self.ask(ControlRequest::Stop, STOP_TIMEOUT)?;
         let asked = Instant::now();
         while self.run.is_running()? {
-            if asked.elapsed() >= FIGURES_PATIENCE {
+            if asked.elapsed() >= FIGURES_TIMEOUT {
                 bail!("{} was told to stop but is still running", self.run.path().display());
             }
             std::thread::sleep(Duration::from_millis(10));

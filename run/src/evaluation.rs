@@ -70,14 +70,24 @@ pub struct EvaluationSummary {
     pub reached_fraction: Option<f64>,
 }
 
+/// Evaluation episodes: 0 … `count` − 1 of a seed. They start in the same states every time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EpisodeSet {
+    /// How many.
+    pub count: u32,
+    /// Their seed.
+    pub seed: u64,
+}
+
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
     let goal = description::of(config)?.goal;
-    evaluate_by(Rollout::new(config, parameters)?, goal, (episodes, seed), |_| ())
+    let episodes = EpisodeSet { count: episodes, seed };
+    evaluate_by(Rollout::new(config, parameters)?, goal, episodes, |_| ())
 }
 
 /// As [`evaluate`], for a run: an environment that another program serves is started as in training. Calls `progress`
-/// with the number of finished episodes. `amount` is the number of episodes and the seed.
+/// with the number of finished episodes.
 ///
 /// # Errors
 /// When the environment fails, or a signal has arrived.
@@ -85,23 +95,23 @@ pub fn evaluate_policy(
     run: &RunDir,
     config: &Config,
     parameters: &[f32],
-    amount: (u32, u64),
+    episodes: EpisodeSet,
     interrupt: &Interrupt,
     progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let rollout = Rollout::of_run(run, config, parameters)?.interruptible_by(interrupt.clone());
-    evaluate_by(rollout, description::of_run(run, config)?.goal, amount, progress)
+    evaluate_by(rollout, description::of_run(run, config)?.goal, episodes, progress)
 }
 
 fn evaluate_by(
     mut rollout: Rollout<'_>,
     goal: Option<Goal>,
-    (episodes, seed): (u32, u64),
+    episodes: EpisodeSet,
     mut progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
-    for number in 0..episodes {
-        let trajectory = rollout.evaluation_episode(seed, number.into())?;
+    for number in 0..episodes.count {
+        let trajectory = rollout.evaluation_episode(episodes.seed, number.into())?;
         returns.push(trajectory.episode_return());
         progress(number + 1);
         if let Some(goal) = &goal {
@@ -113,9 +123,9 @@ fn evaluate_by(
     Ok(EvaluationSummary {
         return_mean,
         return_std,
-        episodes,
+        episodes: episodes.count,
         final_distance_mean: goal.is_some().then(|| mean_and_std(&distances).0),
-        reached_fraction: goal.map(|goal| reached(goal) / f64::from(episodes)),
+        reached_fraction: goal.map(|goal| reached(goal) / f64::from(episodes.count)),
     })
 }
 

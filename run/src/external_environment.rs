@@ -37,10 +37,10 @@ use crate::signals::{Interrupt, describe as describe_signal};
 pub const GYMNASIUM: &str = "gym:";
 
 /// How long a program may take to end after it has left shared memory.
-const LAST_WORDS: Duration = Duration::from_secs(2);
+const END_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A start that takes longer is reported to the user.
-const SLOW: Duration = Duration::from_secs(10);
+const SLOW_START: Duration = Duration::from_secs(10);
 
 /// The default command that serves environments of this name; `None` for built-in environments.
 pub fn default_command(name: &str) -> Option<Vec<String>> {
@@ -75,7 +75,7 @@ pub struct LaunchSpec<'a> {
     /// With seed and index, selects the random streams of its training episodes.
     pub stream: u64,
     /// Where it is started, and with what.
-    pub surroundings: LaunchContext,
+    pub launch_context: LaunchContext,
     /// The file into which it is asked to write pictures, and their greatest height in pixels.
     pub pictures: Option<(PathBuf, u32)>,
     /// The file into which it is asked to write what its numbers mean.
@@ -90,7 +90,7 @@ impl LaunchSpec<'_> {
         };
         let LaunchContext {
             location, hash_seed, ..
-        } = &self.surroundings;
+        } = &self.launch_context;
         let mut command = match location {
             Some(location) => {
                 let mut command = Command::new(location.program());
@@ -243,14 +243,14 @@ impl ExternalEnvironment {
         environment: &EnvironmentConfig,
         environments: u32,
         seed: u64,
-        surroundings: LaunchContext,
+        launch_context: LaunchContext,
         interrupt: Interrupt,
     ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
         let picture_file = domain.directory()?.join("picture");
-        let pictures = surroundings.picture_height.map(|height| (picture_file, height));
+        let pictures = launch_context.picture_height.map(|height| (picture_file, height));
         let description = domain.directory()?.join("description");
         let launch = LaunchSpec {
             pictures: pictures.clone(),
@@ -264,7 +264,7 @@ impl ExternalEnvironment {
             environments,
             seed,
             stream: 0,
-            surroundings,
+            launch_context,
         };
         match open(&domain, &launch, environment, &interrupt) {
             Ok((services, client, listener, spec, program, stop)) => Ok(Self {
@@ -337,7 +337,7 @@ impl ExternalEnvironment {
             StepResult::Taken(observed) => Ok(observed),
             StepResult::Lost => {
                 // It has left shared memory and is about to end. The last lines it writes name the reason.
-                self.program.wait(LAST_WORDS);
+                self.program.wait(END_TIMEOUT);
                 self.program.check()?;
                 bail!("the environment server has lost its episodes")
             }
@@ -384,9 +384,9 @@ impl ExternalEnvironment {
         }
         if asked.elapsed() >= self.limit {
             bail!(
-                "the environment server did not answer within {} s; if it needs more: --set environment.start_seconds={}",
+                "the environment server did not answer within {} s; {}",
                 self.limit.as_secs(),
-                self.limit.as_secs().saturating_mul(5)
+                how_to_give_more_time(self.limit)
             );
         }
         ended(&mut self.program)
@@ -439,11 +439,10 @@ fn open(
         None => match interrupt.signal() {
             Some(signal) => bail!("ended by {}", describe_signal(signal)),
             None => bail!(
-                "{} did not describe itself within {} s; if it takes longer to start: --set \
-                 environment.start_seconds={}",
+                "{} did not describe itself within {} s; {}",
                 environment.name,
                 environment.start_seconds,
-                environment.start_seconds.saturating_mul(5)
+                how_to_give_more_time(environment.start_limit())
             ),
         },
     };
@@ -454,9 +453,17 @@ fn open(
     Ok((services, client, listener, spec, program, stop))
 }
 
+fn how_to_give_more_time(limit: Duration) -> String {
+    let longer = limit.as_secs().saturating_mul(5);
+    format!(
+        "if it needs more: environment.start_seconds={longer}, with --set for a run that is trained, in config/used.toml of \
+         one that is finished"
+    )
+}
+
 /// The error that the program is about to end. The last lines it writes name the reason.
 fn ended<T>(program: &mut ChildProcess) -> anyhow::Result<T> {
-    program.wait(LAST_WORDS);
+    program.wait(END_TIMEOUT);
     program.check()?;
     bail!("the environment server does not answer, and does not end")
 }
@@ -484,13 +491,14 @@ fn stop_when_it_ends(
         .name("watch".into())
         .spawn(move || {
             let ended = |timeout| wait_for_any(&[process.as_fd()], timeout);
-            if !ended(SLOW.min(limit)) && !has_answered.requested() {
+            let first = SLOW_START.min(limit);
+            if !ended(first) && !has_answered.requested() && limit > first {
                 say(format!(
                     "waiting for {name} to start, for at most {} s",
                     limit.as_secs()
                 ));
             }
-            if !ended(limit.saturating_sub(SLOW)) && has_answered.requested() {
+            if !ended(limit - first) && has_answered.requested() {
                 while !ended(Duration::MAX) {}
             }
             flag.request();

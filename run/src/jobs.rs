@@ -12,7 +12,7 @@ use crate::child_process::ChildProcess;
 use crate::signals::Signals;
 
 /// How often `observe` is called without an event.
-const PAUSE: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Interval at which a received signal is checked.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
@@ -58,7 +58,7 @@ pub fn run_jobs<Job: Send, Event: Send>(
         }
         drop(events);
         loop {
-            match receiver.recv_timeout(PAUSE) {
+            match receiver.recv_timeout(POLL_INTERVAL) {
                 Ok(event) => observe(Some(event)),
                 Err(mpsc::RecvTimeoutError::Timeout) => observe(None),
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,

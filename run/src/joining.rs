@@ -47,8 +47,8 @@ fn fill(run: &RunDir, configuration: &str, first_incarnation: u64, interrupt: In
     std::fs::write(&incarnations, (first_incarnation - 1).to_string()).with_context(|| cannot_write(&incarnations))?;
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
-        let surroundings = LaunchContext::of_run(run, &config)?;
-        let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, surroundings, interrupt)?;
+        let launch_context = LaunchContext::of_run(run, &config)?;
+        let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, launch_context, interrupt)?;
         let found = environment.spec();
         if !found.matches(&config.spec) {
             bail!(

@@ -106,7 +106,7 @@ pub(crate) enum Beginning {
 }
 
 impl Beginning {
-    /// Checks that a run with this configuration can begin with it. Counts the rows that it takes along into the run's
+    /// Checks that a run with this configuration can begin with it, and adds the number of initial rows to the run's
     /// steps.
     ///
     /// # Errors

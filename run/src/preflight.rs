@@ -69,6 +69,9 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
         needs::shared_memory(&smaller) <= free
     });
     let advice = match fits {
+        Some(max) if max < config.actors.count => {
+            format!("allow at most {max} actors (--actors {max} --set actors.max={max})")
+        }
         Some(max) => format!("allow at most {max} actors (--set actors.max={max})"),
         None => format!(
             "choose smaller networks ({}.hidden), chunks (actors.chunk_steps), or fewer environments of an actor (actors.envs)",

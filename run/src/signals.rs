@@ -88,10 +88,10 @@ impl Signals {
         Interrupt(Arc::clone(&self.last))
     }
 
-    /// Waits at most `patience` for a signal. Returns the last signal that has arrived, if any.
-    pub fn wait(&self, patience: Duration) -> Option<i32> {
+    /// Waits at most `timeout` for a signal. Returns the last signal that has arrived, if any.
+    pub fn wait(&self, timeout: Duration) -> Option<i32> {
         if self.last.load(Ordering::Relaxed) == 0 {
-            wait_for_any(&[self.as_fd()], patience);
+            wait_for_any(&[self.as_fd()], timeout);
         }
         self.received()
     }

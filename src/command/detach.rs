@@ -23,13 +23,13 @@ use super::training::OutputMode;
 pub(crate) const COMMAND: &str = "in-new-session";
 
 /// How long the start may take, beside what the environment is allowed (`environment.start_seconds`).
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How long a second launcher, which is refused because one is running, may take to end.
-const REFUSED_END: Duration = Duration::from_secs(5);
+const REFUSED_END_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Pause between two looks at a run that starts.
-const PAUSE: Duration = Duration::from_millis(50);
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The output of `--json`.
 #[derive(Serialize)]
@@ -47,14 +47,14 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
     // A run that is running already is refused here. Later its launcher would look like the new one.
     drop(RunDir::open(path)?.lock()?);
     let of_environment = RunClient::open(path)?.config.environment.start_seconds;
-    let patience = PATIENCE + Duration::from_secs(of_environment.into());
+    let timeout = TIMEOUT + Duration::from_secs(of_environment.into());
     let is_at_work = || {
         let status = RunClient::open(path)?.status()?;
         let works = status.is_some_and(|status| status.all_actors_work() || is_in_final_evaluation(&status));
         Ok(works && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
-    start_detached(path, (arguments, patience), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, timeout), output, is_at_work, how_to_end)
 }
 
 /// As [`resume_run`] for a suite. Returns when a process trains one of its runs.
@@ -69,12 +69,12 @@ pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputM
         Ok(file_lock::is_locked(&File::open(path)?)? && runs.any(|run| run.is_running().unwrap_or(false)))
     };
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
-    start_detached(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, TIMEOUT), output, is_at_work, how_to_end)
 }
 
 fn start_detached(
     path: &Path,
-    (arguments, patience): (&[OsString], Duration),
+    (arguments, timeout): (&[OsString], Duration),
     output: &OutputMode,
     is_at_work: impl Fn() -> anyhow::Result<bool>,
     how_to_end: impl Fn(&str, u32) -> String,
@@ -95,7 +95,7 @@ fn start_detached(
     let is_by_child = |since: &mut Option<Instant>| {
         let since = *since.get_or_insert_with(Instant::now);
         let holders = path.metadata().map(|directory| file_lock::holders(&directory));
-        holders.is_ok_and(|holders| holders.contains(&(pid as i32))) || since.elapsed() >= REFUSED_END
+        holders.is_ok_and(|holders| holders.contains(&(pid as i32))) || since.elapsed() >= REFUSED_END_TIMEOUT
     };
     let begun = Instant::now();
     let mut is_over = false;
@@ -111,15 +111,15 @@ fn start_detached(
             let code = status.code().and_then(|code| u8::try_from(code).ok());
             return Ok(code.map_or(ExitCode::FAILURE, ExitCode::from));
         }
-        if begun.elapsed() >= patience {
+        if begun.elapsed() >= timeout {
             write_messages(&mut messages)?;
             end(child);
             bail!(
                 "{here} did not start within {} s and is being stopped; see shoal.log in that directory",
-                patience.as_secs()
+                timeout.as_secs()
             );
         }
-        std::thread::sleep(PAUSE);
+        std::thread::sleep(POLL_INTERVAL);
     }
     write_messages(&mut messages)?;
     if !output.quiet {

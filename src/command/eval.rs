@@ -11,7 +11,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description;
-use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
+use shoal_run::evaluation::{EpisodeSet, EvaluationSummary, SavedPolicy, evaluate_policy};
 use shoal_run::numbers::{parse_count, parse_positive_count};
 use shoal_run::signals::{Signals, describe, exit_code};
 
@@ -41,8 +41,11 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let seed = args.seed.unwrap_or(config.run.seed);
     let signals = Signals::register()?;
     let interrupt = signals.interrupt();
-    let amount = (args.episodes, seed);
-    let evaluated = evaluate_policy(&run, &config, &policy.parameters, amount, &interrupt, |_| ());
+    let episodes = EpisodeSet {
+        count: args.episodes,
+        seed,
+    };
+    let evaluated = evaluate_policy(&run, &config, &policy.parameters, episodes, &interrupt, |_| ());
     if let (Err(_), Some(signal)) = (&evaluated, interrupt.signal()) {
         writeln!(
             std::io::stderr(),

@@ -16,6 +16,8 @@ use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::python;
 use shoal_run::usage::UsageError;
 
+use super::output_file::check_replaceable;
+
 #[derive(Args, Clone, Debug)]
 #[command(group = ArgGroup::new("what").required(true))]
 pub(crate) struct ExportArgs {
@@ -45,6 +47,18 @@ pub(crate) enum Format {
     Onnx,
     /// The weights under PyTorch's names, with metadata.
     Safetensors,
+}
+
+impl Format {
+    /// Whether a file that starts with these bytes is one of this format that Shoal has written.
+    fn is(self, start: &[u8]) -> bool {
+        match self {
+            // The version of ONNX's file format, and the name of the program.
+            Self::Onnx => start.starts_with(b"\x08\x08\x12\x05shoal"),
+            // The length of the header, a small number of 64 bits, and the header, which is JSON.
+            Self::Safetensors => start.get(5..9) == Some(b"\0\0\0{"),
+        }
+    }
 }
 
 /// Writes the policy or the replay and prints the path of the file or dataset.
@@ -88,6 +102,7 @@ fn write_policy(args: &ExportArgs, run: &RunDir, format: Format) -> anyhow::Resu
     };
     let file = format!("{which}.{}", name(format.to_possible_value()));
     let out = args.out.clone().unwrap_or_else(|| args.run.join(file));
+    check_replaceable(&out, "an exported policy of this format", |start| format.is(start))?;
     write_atomically(&out, |to| to.write_all(&bytes))
         .with_context(|| format!("cannot write {}; choose another file with --out", out.display()))?;
     writeln!(std::io::stdout(), "{}", out.display())?;

@@ -14,7 +14,7 @@ use shoal_remote::files::JoinFile;
 use shoal_run::usage::UsageError;
 
 /// How long the gate of an earlier launcher may still be listening: it ends after its launcher, but not at once.
-const EARLIER_GATE: Duration = Duration::from_secs(15);
+const EARLIER_GATE_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// Makes the keys of the run, unless it has them from an earlier start and no new ones are asked for. Returns the path
 /// of the hosts' key.
@@ -24,12 +24,12 @@ fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf
 
     use anyhow::Context;
     use shoal_remote::files::KeyFile;
-    use shoal_remote::keys::{self, VALID};
+    use shoal_remote::keys::{self, VALIDITY};
     use shoal_run::files::is_there;
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
     if new || !(is_there(&gate)? && is_there(&join)?) {
-        let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
+        let keys = keys::make(&config.run.id, SystemTime::now() + VALIDITY)?;
         // If this process is killed in between, one of two keys that do not match must not be left.
         match std::fs::remove_file(&join) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
@@ -96,14 +96,14 @@ impl ListenArgs {
         let Some(endpoint) = &self.listen else { return Ok(false) };
         let mut endpoint = endpoint.parse::<Endpoint>()?;
         let before = JoinFile::read(run.path()).ok();
-        let patience = before.as_ref().map_or(Duration::ZERO, |_| EARLIER_GATE);
+        let timeout = before.as_ref().map_or(Duration::ZERO, |_| EARLIER_GATE_TIMEOUT);
         // A resumed run listens where the hosts of before are trying to reach it.
         if endpoint.to_string() == Endpoint::DEFAULT
             && let Some(before) = before
         {
             endpoint = before.listen;
         }
-        let listen = endpoint.with_port(patience)?;
+        let listen = endpoint.with_port(timeout)?;
         let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let endpoint = listen.seen_from_elsewhere(&machine);
         JoinFile::new(endpoint.clone(), listen).write(run)?;

@@ -1,4 +1,4 @@
-//! Files that `--out` names, of `film` and `report`.
+//! Files that `--out` names, of `export`, `film` and `report`.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};

@@ -28,7 +28,7 @@ pub(crate) struct ScaleArgs {
 }
 
 /// How long the change may take. Retiring actors first hand over their transitions, which the learner may take slowly.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Reads a host's name and its number of actors.
 fn parse_host(text: &str) -> Result<(String, u32), String> {
@@ -54,8 +54,8 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
                 bail!("another command scaled {run} to {} actors", status.actors)
             }
             Some(status) if all_work(&status, here, total) => break,
-            Some(_) if asked.elapsed() >= PATIENCE => {
-                bail!("{run} does not have {total} actors at work after {PATIENCE:?}; `shoal status {run}` shows them")
+            Some(_) if asked.elapsed() >= TIMEOUT => {
+                bail!("{run} does not have {total} actors at work after {TIMEOUT:?}; `shoal status {run}` shows them")
             }
             Some(_) => std::thread::sleep(Duration::from_millis(50)),
         }

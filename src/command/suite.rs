@@ -71,7 +71,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     };
     let common = RunOverrides {
         from: overrides.from.as_deref().map(absolute).transpose()?,
-        demonstrations: overrides.demonstrations_from_anywhere()?,
+        demonstrations: overrides.absolute_dataset()?,
         ..overrides.clone()
     };
     let suite = Suite::new(what, common.arguments(), &sweeps, &seeds)?;

@@ -31,7 +31,7 @@ pub(crate) struct TopArgs {
 const TICK: Duration = Duration::from_millis(200);
 
 /// How long the main loop may take to end after a signal. A tick and the wait in `LauncherLink::close` take less.
-const END_PATIENCE: Duration = Duration::from_secs(3);
+const END_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Shows the run until `q` or a signal, and then restores the terminal.
 pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
@@ -169,7 +169,7 @@ fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
             }
         };
         received.store(number as usize, Ordering::Relaxed);
-        std::thread::sleep(END_PATIENCE);
+        std::thread::sleep(END_TIMEOUT);
         let _ = ratatui::try_restore();
         std::process::exit(128 + number);
     };

@@ -14,7 +14,7 @@ use super::process::Process;
 
 /// A process that has lived this long, or an environment server that has taken [`PROVEN_STEPS`], is able to work. A
 /// process that repeatedly fails earlier is not.
-const PROVEN: Duration = Duration::from_secs(30);
+const PROVEN_AFTER: Duration = Duration::from_secs(30);
 
 /// Failed starts after which a role is given up, if they span `run.give_up_seconds` and twice its longest start.
 const MAX_FAILURES: u32 = 5;
@@ -27,7 +27,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(4);
 const START_TIME: Duration = Duration::from_secs(1);
 
 /// A process without a heartbeat for this long is stopped or stuck. Heartbeats are sent twice a second.
-pub(super) const SILENT: Duration = Duration::from_secs(3);
+pub(super) const SILENT_AFTER: Duration = Duration::from_secs(3);
 
 /// The least time between two heartbeats from which a rate is computed.
 const RATE_SPAN: Duration = Duration::from_millis(400);
@@ -49,6 +49,11 @@ pub(super) struct Child {
     /// Failed starts since the last process that was able to work, and the time of the first of them.
     failures: u32,
     failing_since: Option<Instant>,
+    /// The version of the policy in the process's first heartbeat. A learner begins with that of its checkpoint, an
+    /// evaluator with that of its last evaluation.
+    began_with: u64,
+    /// What the last process began with that was able to work, and then failed by itself.
+    failed_after: Option<u64>,
     /// The longest successful start: from the start until the process was ready.
     longest_good_start: Option<Duration>,
     /// The longest failed start: the life of a process that ended before it was ready.
@@ -99,6 +104,8 @@ impl Child {
             started_at: now,
             failures: 0,
             failing_since: None,
+            began_with: 0,
+            failed_after: None,
             longest_good_start: None,
             longest_failed_start: Duration::ZERO,
             last_heartbeat: None,
@@ -170,8 +177,9 @@ impl Child {
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
         // A process that was stopped could not make progress until now.
-        let is_progress =
-            |(then, before): (Instant, Heartbeat)| now - then >= SILENT || position(&before) != position(heartbeat);
+        let is_progress = |(then, before): (Instant, Heartbeat)| {
+            now - then >= SILENT_AFTER || position(&before) != position(heartbeat)
+        };
         if before.is_none_or(is_progress) {
             self.progress_at = now;
         }
@@ -185,6 +193,7 @@ impl Child {
             self.rate_computed_at = (now, heartbeat.steps);
         }
         let took = first.then(|| now - self.started_at)?;
+        self.began_with = heartbeat.policy_version;
         self.longest_good_start = self.longest_good_start.max(Some(took));
         Some(took)
     }
@@ -195,9 +204,9 @@ impl Child {
         self.handle_end_at(status, give_up_after, Instant::now())
     }
 
-    /// After a process that was able to work, the role is restarted and its failures are forgotten. A kill is no
-    /// failure either if the process was waiting, had made a step, or was within its usual start-up time. Every other
-    /// end is one.
+    /// After a process that was able to work, the role is restarted and its failures are forgotten, unless it fails by
+    /// itself again and again without saving anything. A kill is no failure either if the process was waiting, had made
+    /// a step, or was within its usual start-up time. Every other end is one.
     fn handle_end_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
@@ -205,7 +214,10 @@ impl Child {
         let lived = now - self.started_at;
         let steps = self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.steps);
         let served = self.instance.role == Role::EnvServer && steps >= PROVEN_STEPS;
-        if self.is_ready() && (lived >= PROVEN || served) {
+        if self.is_ready() && (lived >= PROVEN_AFTER || served) {
+            if !was_killed && self.repeats_itself() {
+                return self.count_failure(self.started_at, give_up_after, now);
+            }
             (self.failures, self.failing_since) = (0, None);
             return RestartDecision::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
         }
@@ -220,6 +232,13 @@ impl Child {
             return RestartDecision::Restart(if self.is_ready() { Duration::ZERO } else { FIRST_PAUSE });
         }
         self.count_failure(self.started_at, give_up_after, now)
+    }
+
+    /// Whether the process, which has failed by itself, began where the one that failed before it had begun: nothing has
+    /// been saved since, so the next one would repeat its work. Only learner and evaluator continue from what was saved.
+    fn repeats_itself(&mut self) -> bool {
+        matches!(self.instance.role, Role::Learner | Role::Evaluator)
+            && self.failed_after.replace(self.began_with) == Some(self.began_with)
     }
 
     /// Handles a start that the system refused. The role is given up if its failures span `give_up_after`.
@@ -312,7 +331,8 @@ impl Child {
 
     /// Whether a heartbeat arrived recently.
     pub(super) fn is_responsive(&self) -> bool {
-        self.last_heartbeat.is_some_and(|(then, _)| then.elapsed() < SILENT)
+        self.last_heartbeat
+            .is_some_and(|(then, _)| then.elapsed() < SILENT_AFTER)
     }
 
     /// Its status. `newest` is the version of the learner's newest policy.
@@ -324,7 +344,7 @@ impl Child {
             .map(|(_, heartbeat)| heartbeat.policy_version);
         let state = self.state();
         RoleStatus {
-            role: role.name().into(),
+            role,
             index,
             pid: self.process.as_ref().map(Process::pid),
             state,
@@ -339,7 +359,7 @@ impl Child {
         match (&self.process, self.last_heartbeat) {
             (None, _) if self.is_asked_to_end => RoleState::Done,
             (None, _) => RoleState::Restarting,
-            (_, Some((then, _))) if then.elapsed() >= SILENT => RoleState::Silent,
+            (_, Some((then, _))) if then.elapsed() >= SILENT_AFTER => RoleState::Silent,
             _ if self.is_retiring => RoleState::Retiring,
             _ if self.is_asked_to_end => RoleState::Ending,
             (_, None) => RoleState::Starting,
@@ -528,6 +548,32 @@ mod tests {
         let at_work = child.heartbeat(Activity::Working, 3000);
         let mut ends = (0..100).map(|_| child.live(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
         assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))));
+    }
+
+    #[test]
+    fn a_learner_that_fails_after_long_work_is_given_up_unless_it_has_saved_something_or_was_killed() {
+        let live = |child: &mut Simulation, version, end| {
+            let mut at_work = child.heartbeat(Activity::Working, 3000);
+            at_work.policy_version = version;
+            child.live(2 * PROVEN_AFTER, Some(READY), at_work, end)
+        };
+        for role in [Role::Learner, Role::Evaluator] {
+            let mut child = Simulation::new(role);
+            let mut ends = (0..10).map(|_| live(&mut child, 7, with_code(1)));
+            assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))), "{role:?}");
+
+            let mut child = Simulation::new(role);
+            for version in 0..100 {
+                assert_eq!(
+                    live(&mut child, version, with_code(1)),
+                    RestartDecision::Restart(FIRST_PAUSE)
+                );
+                assert_eq!(
+                    live(&mut child, version, by_signal(KILLED)),
+                    RestartDecision::Restart(Duration::ZERO)
+                );
+            }
+        }
     }
 
     #[test]

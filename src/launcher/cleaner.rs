@@ -13,7 +13,7 @@ use shoal_run::child_process::{ChildGroup, tie_to_parent};
 pub(crate) const COMMAND: &str = "clean-up";
 
 /// How long a clean-up may take. Usually it takes a few milliseconds.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Number of attempts, for the case that a clean-up is killed itself.
 const TRIES: u32 = 3;
@@ -34,7 +34,7 @@ pub(super) fn clean_up(domain: &Domain, services: &Services) -> anyhow::Result<(
     }
     match last {
         Some(status) => bail!("cleaning up shared memory failed: {status}"),
-        None => bail!("cleaning up shared memory took longer than {PATIENCE:?}"),
+        None => bail!("cleaning up shared memory took longer than {TIMEOUT:?}"),
     }
 }
 
@@ -46,7 +46,7 @@ fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
         .args([COMMAND, &std::process::id().to_string(), run_id]);
     // Its output is discarded; the exit code is enough.
     let (mut child, _, _) = ChildGroup::start(&mut command).context("cannot start a process that cleans up")?;
-    Ok(child.wait(PATIENCE))
+    Ok(child.wait(TIMEOUT))
 }
 
 /// The work of the child process of the launcher with this process id.

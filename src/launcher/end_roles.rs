@@ -11,7 +11,7 @@ use super::supervisor::Supervisor;
 const REAP_INTERVAL: Duration = Duration::from_millis(100);
 
 /// How long to wait for a receiver that is being restarted when the roles are requested to end.
-const RESTART: Duration = Duration::from_secs(5);
+const RECEIVER_RESTART_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A request to end the roles, and how they will have ended then.
 #[derive(Clone, Copy, Debug)]
@@ -29,7 +29,7 @@ impl<End> EndRequest<End> {
 
     /// Whether the end may begin. A `receiver` of what the actors send that has just died is restarted first.
     pub(super) fn may_begin(&self, supervisor: &Supervisor, receiver: Role) -> bool {
-        supervisor.is_ready(receiver) || self.at.elapsed() >= RESTART
+        supervisor.is_ready(receiver) || self.at.elapsed() >= RECEIVER_RESTART_TIMEOUT
     }
 }
 
@@ -44,22 +44,22 @@ pub(super) trait EndRoles {
     /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
     fn sleep(&mut self, most: Duration);
 
-    /// Waits until processes have ended that were asked to, and kills them after `patience`.
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration, receiver: Option<Role>) {
-        if !self.have_ended_within(patience, which, receiver) {
+    /// Waits until processes have ended that were asked to, and kills them after `timeout`.
+    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, timeout: Duration, receiver: Option<Role>) {
+        if !self.have_ended_within(timeout, which, receiver) {
             self.parts().0.kill(which);
         }
     }
 
-    /// Waits at most `patience` until processes have ended that were asked to. If the `receiver` of what they send dies
+    /// Waits at most `timeout` until processes have ended that were asked to. If the `receiver` of what they send dies
     /// meanwhile, it is started again, once. Returns whether they have ended.
     fn have_ended_within(
         &mut self,
-        patience: Duration,
+        timeout: Duration,
         which: impl Fn(Role) -> bool,
         mut receiver: Option<Role>,
     ) -> bool {
-        let deadline = Instant::now() + patience;
+        let deadline = Instant::now() + timeout;
         loop {
             let (supervisor, domain) = self.parts();
             if supervisor.reap(&which) {

@@ -1,13 +1,88 @@
-//! The number of processes that a run has started. An incarnation is never used twice, not even by a resumed run.
+//! The incarnations of a run's processes. None is ever used twice, not even by a resumed run.
 
-use std::path::Path;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use shoal_common::channel::control::HostLease;
 use shoal_common::commit::{CommitReader, MAX_INCARNATION, OpenError};
+use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 
+use super::log::Log;
+
+/// More incarnations than are used between two committed chunks, those of other hosts included. If the counter is lost,
+/// this many are skipped.
+const STARTS_WITHOUT_CHUNK: u64 = 64 * HostLease::INCARNATIONS;
+
+/// Counts the processes that the run has started, in a file that lasts over resumes.
+#[derive(Debug)]
+pub(super) struct Incarnations {
+    file: PathBuf,
+    /// The last incarnation that was taken.
+    last: u64,
+    /// The number in the file. Those up to it may be taken without writing the file again.
+    reserved: u64,
+}
+
+impl Incarnations {
+    /// Continues after the incarnations that the run has used.
+    ///
+    /// # Errors
+    /// When the file is damaged, or the file or the replay cannot be read.
+    pub(super) fn open(run: &RunDir, log: &Log) -> anyhow::Result<Self> {
+        let file = run.incarnations();
+        let mut last = read_counter(&file)?;
+        let committed = last_committed(run)?;
+        if last < committed {
+            // The counter was lost. A reused incarnation would repeat noise, and its chunks would count as old ones.
+            last = committed.saturating_add(STARTS_WITHOUT_CHUNK);
+            log.note(
+                "launcher",
+                &format!("{} is missing or wrong; counting from {last}", file.display()),
+            );
+        }
+        Ok(Self {
+            file,
+            last,
+            reserved: last,
+        })
+    }
+
+    /// The last incarnation that was taken.
+    pub(super) fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// Makes sure that no later launcher uses the next `count` incarnations. Doing so for several processes at once
+    /// saves time: on a slow disk, each writing takes up to a second.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(super) fn reserve(&mut self, count: u64) -> anyhow::Result<()> {
+        let needed = self.last + count;
+        if needed > self.reserved {
+            write_atomically(&self.file, |file| file.write_all(needed.to_string().as_bytes()))
+                .with_context(|| format!("cannot write {}", self.file.display()))?;
+            self.reserved = needed;
+        }
+        Ok(())
+    }
+
+    /// Takes the next `count` incarnations. Returns the first of them.
+    ///
+    /// # Errors
+    /// As [`reserve`](Self::reserve).
+    pub(super) fn take(&mut self, count: u64) -> anyhow::Result<u64> {
+        self.reserve(count)?;
+        let first = self.last + 1;
+        self.last += count;
+        Ok(first)
+    }
+}
+
 /// The greatest incarnation of an actor in the run's replay.
-pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
+fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
     let commits = match CommitReader::open(&run.replay_file()) {
         Err(OpenError::NotYet { .. }) => return Ok(0),
         opened => opened?,
@@ -17,7 +92,7 @@ pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
 }
 
 /// The number in the file at `path`; 0 if there is no file.
-pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
+fn read_counter(path: &Path) -> anyhow::Result<u64> {
     let text = match std::fs::read(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(0),
         text => text.with_context(|| format!("cannot read {}", path.display()))?,

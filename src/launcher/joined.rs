@@ -18,13 +18,13 @@ use super::end_roles::{EndRequest, EndRoles};
 use super::log::Log;
 use super::stall::StallDetector;
 use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
-use super::{OTHERS_END, write_iox_config};
+use super::{OTHERS_END_TIMEOUT, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
 const TICK: Duration = Duration::from_millis(100);
 
 /// How long actors may take to hand over what they have.
-const HAND_OVER: Duration = Duration::from_secs(6);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// How the work for another host's run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -136,9 +136,13 @@ impl<'a> JoinedLauncher<'a> {
             ending,
             Ok(JoinEnd::JoinAgain(JoinAgain::Scaled(_)) | JoinEnd::Stopped | JoinEnd::Interrupted(_))
         );
-        self.await_end(|role| role == Role::Actor, HAND_OVER, hands_over.then_some(Role::Relay));
+        self.await_end(
+            |role| role == Role::Actor,
+            HAND_OVER_TIMEOUT,
+            hands_over.then_some(Role::Relay),
+        );
         self.supervisor.ask_to_end(|_| true);
-        self.await_end(|_| true, OTHERS_END, None);
+        self.await_end(|_| true, OTHERS_END_TIMEOUT, None);
         self.control.answer_waiting(&ControlResponse::Accepted);
         let ending = match (ending, &self.end_request) {
             // The request came while the actors handed over what they had.

@@ -15,7 +15,7 @@ use super::requests::waiting;
 use super::supervisor::Supervisor;
 
 /// The time over which rates are averaged.
-const SPAN: Duration = Duration::from_secs(5);
+const RATE_SPAN: Duration = Duration::from_secs(5);
 
 /// Below this share of the configured ratio, the progress line explains why. Early in a run, the lead that the actors
 /// may have lowers the ratio.
@@ -31,7 +31,7 @@ pub(super) struct ProgressLine {
     counts_episodes: bool,
     replay: ReplayConfig,
     learner: Option<LearnerReport>,
-    /// Reports of the last [`SPAN`].
+    /// Reports of the last [`RATE_SPAN`].
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
     evaluated: Option<EvaluationReport>,
     /// When the learner's last report arrived.
@@ -80,7 +80,7 @@ impl ProgressLine {
         self.learner = Some(*report);
         self.reported_at = Instant::now();
         self.recent.push_back((wall, *report));
-        while self.recent.front().is_some_and(|(then, _)| wall - *then > SPAN) {
+        while self.recent.front().is_some_and(|(then, _)| wall - *then > RATE_SPAN) {
             self.recent.pop_front();
         }
     }
@@ -189,7 +189,7 @@ impl ProgressLine {
     }
 
     fn pace(&self, count: impl Fn(&LearnerReport) -> u64) -> Option<f64> {
-        if self.reported_at.elapsed() > SPAN {
+        if self.reported_at.elapsed() > RATE_SPAN {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);

@@ -7,39 +7,39 @@ use std::time::{Duration, Instant};
 
 use shoal_common::role::{Activity, Role};
 
-use super::child::{Child, SILENT};
+use super::child::{Child, SILENT_AFTER};
 
 /// If the launcher itself did not run for this long, it was stopped, and perhaps the others too. No process is replaced
 /// then.
 const LAUNCHER_PAUSE: Duration = Duration::from_secs(2);
 
-/// A process that may be at work is silent for too long only after this multiple of the patience.
+/// A process that may be at work is silent for too long only after this multiple of the timeout.
 const WORKING_FACTOR: u32 = 3;
 
 /// Looks for processes that make no progress.
 #[derive(Debug)]
 pub(super) struct StallDetector {
-    patience: Duration,
+    timeout: Duration,
     /// Whether it sees all processes of the run, and not only those of a joined host.
     sees_whole_run: bool,
     checked_at: Instant,
 }
 
 impl StallDetector {
-    /// `patience` is the longest time without progress.
-    pub(super) fn new(patience: Duration) -> Self {
+    /// `timeout` is the longest time without progress.
+    pub(super) fn new(timeout: Duration) -> Self {
         Self {
-            patience: patience.max(SILENT),
+            timeout: timeout.max(SILENT_AFTER),
             sees_whole_run: true,
             checked_at: Instant::now(),
         }
     }
 
     /// For the processes of a joined host. All of them may wait for the learner's host.
-    pub(super) fn of_joined_host(patience: Duration) -> Self {
+    pub(super) fn of_joined_host(timeout: Duration) -> Self {
         Self {
             sees_whole_run: false,
-            ..Self::new(patience)
+            ..Self::new(timeout)
         }
     }
 
@@ -66,7 +66,7 @@ impl StallDetector {
         found
     }
 
-    /// Environment servers that have spent more than the patience on one step or reset while their clients wait, and
+    /// Environment servers that have spent more than the timeout on one step or reset while their clients wait, and
     /// for how long. They are left alone.
     pub(super) fn slow_servers(&self, children: &[Child]) -> Vec<(usize, Duration)> {
         let is_waited_for = |index| {
@@ -78,7 +78,7 @@ impl StallDetector {
         });
         servers
             .map(|(i, server)| (i, server.silent_for()))
-            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].instance.index))
+            .filter(|(i, silent)| *silent >= self.timeout && is_waited_for(children[*i].instance.index))
             .collect()
     }
 
@@ -99,7 +99,7 @@ impl StallDetector {
         if self.waits_for_an_idle_server(children, child) && child.stalls == 0 {
             return Some("it waits for an answer from its environment server, which is idle");
         }
-        let silent = child.silent_for() >= WORKING_FACTOR * self.patience;
+        let silent = child.silent_for() >= WORKING_FACTOR * self.timeout;
         let idle_server = child
             .server()
             .is_none_or(|index| find(children, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));
@@ -110,7 +110,7 @@ impl StallDetector {
         let server = client.server().and_then(|index| find(children, Role::EnvServer, index));
         let waits = match client.activity() {
             // It becomes ready when its server has described its environments.
-            None => client.is_active() && client.progress_at.elapsed() >= self.patience,
+            None => client.is_active() && client.progress_at.elapsed() >= self.timeout,
             Some(activity) => activity == Activity::WaitingForServer && self.is_idle(client),
         };
         waits && server.is_some_and(|server| self.is_idle(server))
@@ -118,10 +118,11 @@ impl StallDetector {
 
     /// Whether it has waited without progress for too long.
     fn is_idle(&self, child: &Child) -> bool {
-        child.is_active() && child.is_waiting() && child.progress_at.elapsed() >= self.patience
+        child.is_active() && child.is_waiting() && child.progress_at.elapsed() >= self.timeout
     }
 
-    /// If all processes wait: the actors and the evaluator, or, if replacing them has not helped, the learner.
+    /// The processes to replace if every process waits: first actors and evaluator; if that has not helped, the
+    /// learner.
     fn deadlock(&self, children: &[Child]) -> Vec<(usize, &'static str)> {
         if !children.iter().all(|child| self.is_idle(child)) {
             return Vec::new();

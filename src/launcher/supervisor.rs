@@ -13,11 +13,10 @@ use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow};
-use shoal_common::channel::control::{ControlPort, HostLease, RoleStatus};
+use anyhow::anyhow;
+use shoal_common::channel::control::{ControlPort, RoleStatus};
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
-use shoal_common::durable::write_atomically;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
@@ -29,7 +28,7 @@ use tracing_subscriber::filter::LevelFilter;
 use self::cleaning::Cleaning;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
-use super::incarnations::{last_committed, read_counter};
+use super::incarnations::Incarnations;
 use super::joined_hosts::JoinedHosts;
 use super::log::Log;
 use super::process::{Process, describe_exit, name};
@@ -38,10 +37,6 @@ use crate::log_level::log_level;
 
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
-
-/// More incarnations than are used between two committed chunks, those of other hosts included. If the counter is lost,
-/// this many are skipped.
-const STARTS_WITHOUT_CHUNK: u64 = 64 * HostLease::INCARNATIONS;
 
 /// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,11 +96,7 @@ pub(super) struct Supervisor {
     server_output: Writer,
     /// How long an environment's own program may take to start.
     server_start_limit: Option<Duration>,
-    /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
-    counter: PathBuf,
-    processes_started: u64,
-    /// The number in that file. Those up to it may be used without writing the file again.
-    reserved: u64,
+    incarnations: Incarnations,
     faults: Faults,
     /// A role is given up if its failures span this time.
     give_up_after: Duration,
@@ -123,17 +114,7 @@ impl Supervisor {
         log: Log,
         host: SupervisedHost,
     ) -> anyhow::Result<Self> {
-        let counter = run.incarnations();
-        let mut started = read_counter(&counter)?;
-        let committed = last_committed(run)?;
-        if started < committed {
-            // The counter was lost. A reused incarnation would repeat noise, and its chunks would count as old ones.
-            started = committed.saturating_add(STARTS_WITHOUT_CHUNK);
-            log.note(
-                "launcher",
-                &format!("{} is missing or wrong; counting from {started}", counter.display()),
-            );
-        }
+        let incarnations = Incarnations::open(run, &log)?;
         let is_learner_host = matches!(host, SupervisedHost::OfLearner { .. });
         let mut services = Services::new(domain)?;
         services.create_common(domain)?;
@@ -167,7 +148,7 @@ impl Supervisor {
             cleaning: Cleaning::new(),
             actors,
             actors_to_take: 0,
-            joined_hosts: JoinedHosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
+            joined_hosts: JoinedHosts::new(incarnations.last(), Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
             max_actors_here: config.actors.max_on_a_host(),
             lockstep_actors,
@@ -183,9 +164,7 @@ impl Supervisor {
                 .environment
                 .is_external()
                 .then(|| config.environment.start_limit()),
-            counter,
-            processes_started: started,
-            reserved: started,
+            incarnations,
             faults: Faults {
                 count: 0,
                 most: config.environment.faults,
@@ -201,7 +180,8 @@ impl Supervisor {
     /// Starts all processes.
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
-        self.reserve_incarnations((self.children.len() + self.missing().len()) as u64)?;
+        self.incarnations
+            .reserve((self.children.len() + self.missing().len()) as u64)?;
         (0..self.children.len()).try_for_each(|i| self.start(i).map(drop))?;
         self.start_missing(domain)
     }
@@ -209,27 +189,6 @@ impl Supervisor {
     /// The incidents since the last call, in order.
     pub(super) fn take_incidents(&mut self) -> Vec<Incident> {
         std::mem::take(&mut self.incidents)
-    }
-
-    /// Makes sure that no later launcher uses the next `count` incarnations. Doing so for several processes at once
-    /// saves time: on a slow disk, each writing takes up to a second.
-    fn reserve_incarnations(&mut self, count: u64) -> anyhow::Result<()> {
-        let needed = self.processes_started + count;
-        if needed > self.reserved {
-            let text = needed.to_string();
-            write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
-                .with_context(|| format!("cannot write {}", self.counter.display()))?;
-            self.reserved = needed;
-        }
-        Ok(())
-    }
-
-    /// Takes the next `count` incarnations. Returns the first of them.
-    fn take_incarnations(&mut self, count: u64) -> anyhow::Result<u64> {
-        self.reserve_incarnations(count)?;
-        let first = self.processes_started + 1;
-        self.processes_started += count;
-        Ok(first)
     }
 
     /// Starts a role's process. If the system refuses to, as it does while there are too many processes or open files,
@@ -249,7 +208,7 @@ impl Supervisor {
     /// # Errors
     /// When the counter of incarnations cannot be written, or the system refuses.
     fn start_now(&mut self, i: usize) -> anyhow::Result<()> {
-        let incarnation = self.take_incarnations(1)?;
+        let incarnation = self.incarnations.take(1)?;
         let child = &mut self.children[i];
         child.instance.incarnation = incarnation;
         let writer = match child.instance.role {

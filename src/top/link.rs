@@ -1,6 +1,6 @@
 //! The connection to the run's launcher, on its own thread, so that a slow answer does not delay the keys.
 
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, channel, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,10 @@ use shoal_run::status::saved_status;
 const INTERVAL: Duration = Duration::from_secs(1);
 
 /// How long to wait for a poll in progress at the end.
-const END_PATIENCE: Duration = Duration::from_secs(1);
+const END_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Events that wait for the screen. A terminal that is stopped, as with Ctrl-S, draws none.
+const MAX_UNREAD: usize = 8;
 
 /// A request to the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,7 +54,8 @@ impl LauncherLink {
     /// When the thread cannot be started.
     pub(crate) fn new(client: RunClient) -> anyhow::Result<Self> {
         let (requests, incoming) = channel();
-        let (outgoing, events) = channel();
+        // While the terminal is stopped, the thread waits.
+        let (outgoing, events) = sync_channel(MAX_UNREAD);
         let thread = thread::Builder::new()
             .name("poll".into())
             .spawn(move || poll_until_closed(&client, &incoming, &outgoing))
@@ -86,13 +90,13 @@ impl LauncherLink {
     pub(crate) fn close(mut self) {
         self.requests = None;
         let asked = Instant::now();
-        while !self.thread.is_finished() && asked.elapsed() < END_PATIENCE {
+        while !self.thread.is_finished() && asked.elapsed() < END_TIMEOUT {
             thread::sleep(Duration::from_millis(5));
         }
     }
 }
 
-fn poll_until_closed(client: &RunClient, requests: &Receiver<Request>, events: &Sender<RunEvent>) {
+fn poll_until_closed(client: &RunClient, requests: &Receiver<Request>, events: &SyncSender<RunEvent>) {
     let mut ended = false;
     loop {
         let event = poll(client, ended);

@@ -10,6 +10,7 @@ use ratatui::widgets::{
     Axis, Block, Borders, Cell, Chart, Clear, Dataset, Gauge, GraphType, Paragraph, Row, Sparkline, Table,
 };
 use shoal_common::channel::control::{HostState, RoleState, RoleStatus};
+use shoal_common::role::Role;
 use shoal_run::numbers::thousands;
 
 use super::{LauncherState, Overlay, Screen};
@@ -147,9 +148,8 @@ fn draw_roles(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
         return;
     }
     let rank = |role: &RoleStatus| {
-        ["learner", "evaluator", "actor"]
-            .iter()
-            .position(|name| *name == role.role)
+        let first = [Role::Learner, Role::Evaluator, Role::Actor];
+        first.iter().position(|first| *first == role.role)
     };
     roles.sort_by_key(|role| (rank(role).unwrap_or(usize::MAX), role.index));
     let wide = area.width >= ALL_COLUMNS;

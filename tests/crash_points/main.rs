@@ -168,7 +168,7 @@ fn a_process_killed_before_a_call_has_not_made_it() {
 }
 
 fn a_role_killed_before_a_call_is_replaced_and_the_run_completes() {
-    kill_before_some_calls(User::Own, &[Mode::Free], &ROLES, [2, 3, 1]);
+    kill_before_some_calls(User::Own, &[Mode::Free], &ROLES, [1, 2, 1]);
 }
 
 fn an_evaluator_killed_before_a_call_is_replaced() {
@@ -199,7 +199,7 @@ fn a_python_server_killed_before_a_call_is_replaced() {
 }
 
 fn an_ordinary_users_run_survives_the_same_kills() {
-    kill_before_some_calls(User::Nobody, &[Mode::Free], &ROLES, [1, 2, 0]);
+    kill_before_some_calls(User::Nobody, &[Mode::Free], &ROLES, [1, 1, 0]);
 }
 
 fn every_crash_point() {

@@ -1,4 +1,4 @@
-"""Writes the reference rollouts of Gymnasium that `tests/golden.rs` compares our environments with.
+"""Writes the reference rollouts of Gymnasium that `tests/golden/main.rs` compares our environments with.
 
     pip install gymnasium==1.4.0 numpy==2.4.6
     python tests/golden/make_env_golden.py DIRECTORY

@@ -29,20 +29,14 @@ const MAY_IMPORT: [(&str, &[&str]); 13] = [
     ("shoal-remote", &["shoal-common"]),
     ("shoal-run", &CORE),
     ("shoal-report", &RUN_AND_CORE),
-    ("shoal-bench", &REMOTE_RUN_AND_CORE),
+    ("shoal-bench", &ACTOR_REMOTE_RUN_AND_CORE),
     ("shoal-reproduce", &REPORT_RUN_AND_CORE),
     ("shoal", &EVERYTHING),
 ];
 
-const CORE: [&str; 4] = ["shoal-common", "shoal-env-server", "shoal-actor", "shoal-learner"];
-const RUN_AND_CORE: [&str; 5] = [
-    "shoal-run",
-    "shoal-common",
-    "shoal-env-server",
-    "shoal-actor",
-    "shoal-learner",
-];
-const REMOTE_RUN_AND_CORE: [&str; 6] = [
+const CORE: [&str; 3] = ["shoal-common", "shoal-env-server", "shoal-learner"];
+const RUN_AND_CORE: [&str; 4] = ["shoal-run", "shoal-common", "shoal-env-server", "shoal-learner"];
+const ACTOR_REMOTE_RUN_AND_CORE: [&str; 6] = [
     "shoal-remote",
     "shoal-run",
     "shoal-common",
@@ -50,12 +44,11 @@ const REMOTE_RUN_AND_CORE: [&str; 6] = [
     "shoal-actor",
     "shoal-learner",
 ];
-const REPORT_RUN_AND_CORE: [&str; 6] = [
+const REPORT_RUN_AND_CORE: [&str; 5] = [
     "shoal-report",
     "shoal-run",
     "shoal-common",
     "shoal-env-server",
-    "shoal-actor",
     "shoal-learner",
 ];
 const EVERYTHING: [&str; 9] = [

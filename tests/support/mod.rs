@@ -1,6 +1,7 @@
 //! Runs the real program as a user would, in a directory of its own, and checks what it leaves behind.
 
 #![allow(dead_code, reason = "every suite uses a different part of this file")]
+#![allow(clippy::print_stderr, reason = "a failed test explains itself")]
 
 use std::collections::{BTreeMap, HashSet};
 use std::os::unix::process::CommandExt;
@@ -331,8 +332,41 @@ impl Running {
     }
 }
 
+/// Lines of the log that are shown when a test has failed.
+const SHOWN_LINES: usize = 30;
+
+impl Running {
+    /// What is known of the run, to explain the failure of its test: outcome, log, and where its processes wait.
+    fn state(&self) -> String {
+        let outcome = std::fs::read_to_string(self.run.join("outcome.json")).unwrap_or_default();
+        let log = self.log();
+        let lines: Vec<&str> = log.lines().collect();
+        let mut text = format!("{}: {outcome}\n", self.run.display());
+        for line in &lines[lines.len().saturating_sub(SHOWN_LINES)..] {
+            text += &format!("  {line}\n");
+        }
+        let roles = pids(&log).into_iter().filter(|(_, pid)| is_ours(*pid, &self.run));
+        for (name, pid) in roles.chain([("launcher".to_owned(), self.child.id() as i32)]) {
+            let threads = std::fs::read_dir(format!("/proc/{pid}/task"))
+                .into_iter()
+                .flatten()
+                .flatten();
+            for thread in threads {
+                let read = |file| std::fs::read_to_string(thread.path().join(file)).unwrap_or_default();
+                let [thread, waits, call] = ["comm", "wchan", "syscall"].map(read);
+                let (thread, call) = (thread.trim_end(), call.trim_end());
+                text += &format!("  {name} {pid}, thread {thread}: in {waits}, system call {call}\n");
+            }
+        }
+        text
+    }
+}
+
 impl Drop for Running {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("{}", self.state());
+        }
         let _ = self.child.kill();
         let _ = self.child.wait();
         let processes = pids(&self.log());
@@ -352,6 +386,9 @@ impl Drop for Running {
 /// Killed processes leave their shared memory to the next start of a run. This test may be the last to start one.
 impl Drop for Workplace {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("standard error of the run: {}", self.stderr());
+        }
         let _ = Domain::remove_abandoned();
     }
 }

@@ -36,6 +36,21 @@ fn a_policy_is_exported_in_both_formats_and_runs_in_other_software() {
     assert_eq!(tensors.tensor("layers.0.weight").unwrap().shape(), [24, 3]);
     assert_eq!(tensors.tensor("layers.2.weight").unwrap().shape(), [1, 16]);
     assert_eq!(tensors.tensor("layers.2.bias").unwrap().shape(), [1]);
+
+    // An exported policy may be replaced, and nothing else.
+    printed(&["--format", "onnx", "--policy", "last"]);
+    printed(&["--format", "safetensors", "--out", "policy.safetensors"]);
+    for (format, out) in [
+        ("onnx", "run/config.toml"),
+        ("onnx", "policy.safetensors"),
+        ("safetensors", "run/last.onnx"),
+        ("safetensors", "run/replay.bin"),
+    ] {
+        let before = std::fs::read(place.path().join(out)).unwrap();
+        let message = error_line(&place.output(&["export", "run", "--format", format, "--out", out]));
+        assert!(message.contains("is not an exported policy"), "{message}");
+        assert!(std::fs::read(place.path().join(out)).unwrap() == before, "{out}");
+    }
 }
 
 #[test]

@@ -168,7 +168,7 @@ impl Training {
     }
 
     /// Role, index and process id of every process.
-    pub(super) fn processes(&self) -> anyhow::Result<Vec<(String, u32, u32)>> {
+    pub(super) fn processes(&self) -> anyhow::Result<Vec<(Role, u32, u32)>> {
         let status = self.observer()?.client.status()?.context("the training has ended")?;
         let processes = status.roles.into_iter();
         Ok(processes

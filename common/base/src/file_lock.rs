@@ -7,20 +7,20 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 /// Pause between two attempts to take a lock that another process holds.
-const PAUSE: Duration = Duration::from_millis(1);
+const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Locks the file exclusively, waiting at most `patience`. Returns whether it is locked now.
+/// Locks the file exclusively, waiting at most `timeout`. Returns whether it is locked now.
 ///
 /// # Errors
 /// When the system refuses for another reason than a lock of another process.
-pub fn lock(file: &File, patience: Duration) -> io::Result<bool> {
-    let deadline = Instant::now() + patience;
+pub fn lock(file: &File, timeout: Duration) -> io::Result<bool> {
+    let deadline = Instant::now() + timeout;
     loop {
         match file.try_lock() {
             Ok(()) => return Ok(true),
             Err(TryLockError::Error(cause)) => return Err(cause),
             Err(TryLockError::WouldBlock) if Instant::now() >= deadline => return Ok(false),
-            Err(TryLockError::WouldBlock) => thread::sleep(PAUSE),
+            Err(TryLockError::WouldBlock) => thread::sleep(RETRY_INTERVAL),
         }
     }
 }

@@ -33,17 +33,23 @@ impl Role {
         }
     }
 
+    const ALL: [Self; 6] = [
+        Self::EnvServer,
+        Self::Actor,
+        Self::Evaluator,
+        Self::Learner,
+        Self::Gate,
+        Self::Relay,
+    ];
+
+    /// The role with this name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|role| role.name() == name)
+    }
+
     /// The role with this number in a message.
     pub(crate) fn from_code(code: u32) -> Option<Self> {
-        let all = [
-            Self::EnvServer,
-            Self::Actor,
-            Self::Evaluator,
-            Self::Learner,
-            Self::Gate,
-            Self::Relay,
-        ];
-        all.into_iter().find(|role| *role as u32 == code)
+        Self::ALL.into_iter().find(|role| *role as u32 == code)
     }
 }
 

@@ -35,10 +35,10 @@ const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
 const MIN_AGE: Duration = Duration::from_millis(50);
 
 /// How long a clean-up waits for unfinished files whose makers may be alive.
-const MAKER_PATIENCE: Duration = Duration::from_millis(200);
+const MAKER_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// How long iceoryx2 may wait for another process that cleans up after the same dead process.
-const OTHER_CLEANER: Duration = Duration::from_millis(100);
+const OTHER_CLEANER_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// A thread that removes unfinished files of killed processes until this is dropped.
 #[derive(Debug)]
@@ -146,7 +146,7 @@ impl Domain {
             cause,
         })?;
         // iceoryx2 would never free a port with an unfinished connection, so unfinished connections are removed first.
-        let deadline = Instant::now() + MAKER_PATIENCE;
+        let deadline = Instant::now() + MAKER_TIMEOUT;
         let listing = || io_error("clean up", Path::new(SHARED_MEMORY));
         while !remove_unfinished(run_id).map_err(listing())? && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(2));
@@ -175,7 +175,7 @@ fn clean_up_dead_nodes(config: &Config) -> u32 {
     let mut failed = 0;
     let listed = Node::<ipc::Service>::list(config, |state| {
         if let NodeState::Dead(node) = state
-            && let Err(error) = node.blocking_remove_stale_resources(OTHER_CLEANER)
+            && let Err(error) = node.blocking_remove_stale_resources(OTHER_CLEANER_TIMEOUT)
         {
             tracing::debug!(?error, "could not clean up after a process");
             failed += 1;
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn only_half_made_files_of_dead_processes_are_removed() {
+    fn only_unfinished_files_of_dead_processes_are_removed() {
         // Without a member of their run, another run that starts now would remove these files.
         let (members, _) = Leftover::new("members", 0o600, b"");
         let _presence = Presence::enter(&run_id()).unwrap();

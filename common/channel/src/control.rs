@@ -53,7 +53,7 @@ const RESPONSE_BYTES_PER_HOST: usize = 192;
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// How long a request about the status waits for a launcher without a service.
-const MISSING_PATIENCE: Duration = Duration::from_secs(1);
+const MISSING_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How often the client checks that the launcher is still alive.
 const LIVENESS_INTERVAL: Duration = Duration::from_millis(100);
@@ -190,19 +190,19 @@ fn send(request: &UnansweredRequest, answer: &ControlResponse) {
 /// Asks the launcher of `run` and waits for the answer while `is_alive` returns true.
 ///
 /// # Errors
-/// When the launcher ends, there is no answer within `patience`, or the answer cannot be read.
+/// When the launcher ends, there is no answer within `timeout`, or the answer cannot be read.
 pub fn ask(
     domain: &Domain,
     run: RunDirId,
     request: ControlRequest,
-    patience: Duration,
+    timeout: Duration,
     is_alive: impl Fn() -> bool,
 ) -> Result<ControlResponse, ControlError> {
     let asked = Instant::now();
-    let deadline = asked + patience;
+    let deadline = asked + timeout;
     // A status request gives up sooner: it need not wait until the launcher can answer.
     let missing_until = match request {
-        ControlRequest::Status => deadline.min(asked + MISSING_PATIENCE),
+        ControlRequest::Status => deadline.min(asked + MISSING_TIMEOUT),
         _ => deadline,
     };
     let request = encode(&AddressedRequest { run, request }).map_err(cannot_ask)?;
@@ -236,7 +236,7 @@ pub fn ask(
     let mut pending = ask(&request)?;
     notify();
     // Making the client writes files, which takes seconds where the disk is busy. That is no silence of the launcher.
-    let deadline = Instant::now() + patience;
+    let deadline = Instant::now() + timeout;
     let mut checked = Instant::now();
     let mut gone = false;
     loop {

@@ -19,7 +19,7 @@ use super::memory;
 use super::presence::{self, Claim, Presence};
 
 /// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
-const LOCK_PATIENCE: Duration = Duration::from_secs(30);
+const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// The node name of processes that join a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
@@ -181,8 +181,8 @@ impl Domain {
     }
 
     /// Whether the run's files outside `/dev/shm` still exist, including the files of `services` services. Without them
-    /// the processes of the run no longer find each other. What cannot be inspected, as when too many files are open, counts
-    /// as existing.
+    /// the processes of the run no longer find each other. What cannot be inspected, as when too many files are open,
+    /// counts as existing.
     pub fn is_intact(&self, services: usize) -> bool {
         let Ok(directory) = self.directory() else {
             return true;
@@ -228,10 +228,10 @@ impl Domain {
     /// caller must hold the lock of the run directory.
     ///
     /// # Errors
-    /// When some are still alive after `patience`, for example because they are stopped.
-    pub fn wait_for_earlier_processes(run_id: &str, patience: Duration) -> Result<(), DomainError> {
+    /// When some are still alive after `timeout`, for example because they are stopped.
+    pub fn wait_for_earlier_processes(run_id: &str, timeout: Duration) -> Result<(), DomainError> {
         let root = user_root()?;
-        let deadline = Instant::now() + patience;
+        let deadline = Instant::now() + timeout;
         loop {
             let (mut left, is_free) = {
                 let _lock = lock(&root.join(run_id))?;
@@ -254,32 +254,48 @@ impl Domain {
         }
     }
 
-    /// Removes the files of this user's runs that no longer have a living process.
+    /// Removes the files of this user's runs that no longer have a living process. What cannot be inspected or removed
+    /// for the moment is left to the next call: it is no fault of the run that is about to start.
     ///
     /// # Errors
-    /// When the user's directory cannot be read, or files cannot be removed.
+    /// When the user's directory or `/dev/shm` cannot be read.
     pub fn remove_abandoned() -> Result<(), DomainError> {
         let root = user_root()?;
         let listing = std::fs::read_dir(&root).map_err(io_error("list", &root))?;
-        for entry in listing.flatten() {
-            if entry.path().is_dir()
-                && let Some(run_id) = entry.file_name().to_str()
-                // A held lock shows that a process of the run is alive.
-                && let Attempt::Locked(_lock) = try_lock(&entry.path())?
-            {
-                remove_if_dead(&root, run_id)?;
+        for entry in listing.flatten().filter(|entry| entry.path().is_dir()) {
+            if let Some(run_id) = entry.file_name().to_str() {
+                leave_to_the_next(run_id, remove_if_unlocked(&root, run_id));
             }
         }
         // Runs whose directory another program has removed.
         let runs = presence::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
         for run_id in runs.iter().filter(|run_id| !root.join(run_id).exists()) {
-            if matches!(claim(run_id)?, Claim::Free { .. }) {
-                let _lock = make_and_lock(&root.join(run_id))?;
-                remove_if_dead(&root, run_id)?;
-            }
+            leave_to_the_next(run_id, remove_without_directory(&root, run_id));
         }
         Ok(())
     }
+}
+
+fn leave_to_the_next(run_id: &str, removed: Result<(), DomainError>) {
+    if let Err(error) = removed {
+        tracing::debug!("what is left of run {run_id} was not removed: {error}");
+    }
+}
+
+fn remove_if_unlocked(root: &Path, run_id: &str) -> Result<(), DomainError> {
+    match try_lock(&root.join(run_id))? {
+        Attempt::Locked(_lock) => remove_if_dead(root, run_id),
+        // A held lock shows that a process of the run is alive.
+        Attempt::Held | Attempt::Absent => Ok(()),
+    }
+}
+
+fn remove_without_directory(root: &Path, run_id: &str) -> Result<(), DomainError> {
+    if matches!(claim(run_id)?, Claim::Free { .. }) {
+        let _lock = make_and_lock(&root.join(run_id))?;
+        remove_if_dead(root, run_id)?;
+    }
+    Ok(())
 }
 
 fn is_missing(error: &io::Error) -> bool {
@@ -395,7 +411,7 @@ enum Attempt {
 
 /// Takes the lock of the run in this directory; `None` if there is no such run.
 fn lock(directory: &Path) -> Result<Option<File>, DomainError> {
-    let deadline = Instant::now() + LOCK_PATIENCE;
+    let deadline = Instant::now() + LOCK_TIMEOUT;
     loop {
         match try_lock(directory)? {
             Attempt::Locked(lock) => return Ok(Some(lock)),

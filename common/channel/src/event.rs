@@ -131,16 +131,16 @@ impl Listener {
         })
     }
 
-    /// Blocks until there is a notification, at most `patience`. Returns whether there was one.
+    /// Blocks until there is a notification, at most `timeout`. Returns whether there was one.
     ///
     /// # Errors
     /// When the system cannot wait for the listener.
-    pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
+    pub fn wait(&self, timeout: Duration) -> Result<bool, ChannelError> {
         // The listener's own `timed_wait` does the same with twice as many system calls. The conversion fails only for
-        // a `patience` that is practically infinite; `None` then waits without a limit.
-        let patience = Timespec::try_from(patience).ok();
+        // a `timeout` that is practically infinite; `None` then waits without a limit.
+        let timeout = Timespec::try_from(timeout).ok();
         let mut ready = [PollFd::from_borrowed_fd(self.as_fd(), PollFlags::IN)];
-        match poll(&mut ready, patience.as_ref()) {
+        match poll(&mut ready, timeout.as_ref()) {
             // An interruption is not an error: a process that was stopped and continued also returns here.
             Ok(_) | Err(Errno::INTR) => {}
             Err(errno) => return Err(self.failed(io::Error::from(errno))),

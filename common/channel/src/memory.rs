@@ -15,7 +15,7 @@ use super::files::{SHARED_MEMORY, prefix};
 /// The unit in which a file takes memory, in bytes.
 const PAGE: usize = 4096;
 
-// What iceoryx2 0.10 adds to the requested sizes: measured and rounded up. `tests/room.rs` compares them with real
+// What iceoryx2 0.10 adds to the requested sizes: measured and rounded up. `tests/resources.rs` compares them with real
 // files.
 const SEGMENT: usize = 512;
 const CHUNK_INDEX: usize = 4;

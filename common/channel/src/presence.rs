@@ -17,7 +17,7 @@ use super::files::{SHARED_MEMORY, prefix};
 const MEMBERS: &str = "members";
 
 /// How long to wait for a process that removes the files of an earlier run with this name. It takes some milliseconds.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Shows that this process is a member of a run.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ impl Presence {
     /// # Errors
     /// When the file cannot be made or locked.
     pub(super) fn enter(run_id: &str) -> io::Result<Self> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let Some(file) = open(run_id, true)? else {
                 return Ok(Self(None));

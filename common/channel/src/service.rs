@@ -42,13 +42,13 @@ pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName
 }
 
 /// How long to wait for a port that a dead predecessor occupies.
-pub(super) const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
+pub(super) const CLAIM_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is
 /// transient: a dead process may occupy the port until the launcher has cleaned up after it, and its unfinished files
 /// exist until they are removed. Any other failure is returned at once.
 pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
-    let deadline = Instant::now() + CLAIM_PATIENCE;
+    let deadline = Instant::now() + CLAIM_TIMEOUT;
     loop {
         match attempt() {
             Err(error) if error.is_transient() && Instant::now() < deadline => {
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn opening_a_half_made_service_is_retried() {
+    fn opening_an_unfinished_service_is_retried() {
         let domain = domain("cb");
         let held = service::<u64>(&domain, OpenMode::Create).unwrap();
         let services = domain.directory().unwrap().join("services");
@@ -179,7 +179,7 @@ mod tests {
                 attempt()
             });
             assert_eq!(attempts, 1, "{error:?}");
-            assert!(begun.elapsed() < CLAIM_PATIENCE);
+            assert!(begun.elapsed() < CLAIM_TIMEOUT);
             error.unwrap_err()
         };
         let missing = claimed(&|| service::<u64>(&domain, OpenMode::Open).map(drop));

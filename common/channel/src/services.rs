@@ -1,5 +1,5 @@
 //! The services of a run. The launcher creates each of them before it starts a process that opens it, and holds them to
-//! the end. Other processes only open services, so one that is killed while it starts leaves no half-made service
+//! the end. Other processes only open services, so one that is killed while it starts leaves no unfinished service
 //! behind.
 
 use std::fs::OpenOptions;
@@ -28,7 +28,7 @@ pub struct Services {
 }
 
 impl Services {
-    /// Starts with no services, and starts a [`Sweeper`] that removes half-made files of killed processes.
+    /// Starts with no services, and starts a [`Sweeper`] that removes unfinished files of killed processes.
     ///
     /// # Errors
     /// When the sweeper's thread cannot be started.

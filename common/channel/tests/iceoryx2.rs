@@ -16,7 +16,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 const DIRECTORY: &str = "ICEORYX2_TEST_DIRECTORY";
 
 /// How long an operation may take that is over in microseconds unless it never ends.
-const PATIENCE: Duration = Duration::from_secs(3);
+const TIMEOUT: Duration = Duration::from_secs(3);
 
 /// The files of a test: a root directory, and names in shared memory with a prefix of its own. They are removed on
 /// drop.
@@ -94,7 +94,7 @@ impl Place {
     fn clean_up(&self) {
         Node::<ipc::Service>::list(&config(self.directory.path()), |state| {
             if let NodeState::Dead(node) = state {
-                let _ = node.blocking_remove_stale_resources(PATIENCE);
+                let _ = node.blocking_remove_stale_resources(TIMEOUT);
             }
             CallbackProgression::Continue
         })
@@ -177,7 +177,7 @@ fn a_segment_without_a_size_is_opened_forever_by_root() {
     let mut child = place.child(test);
     let begun = Instant::now();
     let mut ended = None;
-    while ended.is_none() && begun.elapsed() < PATIENCE {
+    while ended.is_none() && begun.elapsed() < TIMEOUT {
         std::thread::sleep(Duration::from_millis(20));
         ended = child.try_wait().unwrap();
     }

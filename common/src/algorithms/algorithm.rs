@@ -37,13 +37,14 @@ pub enum TransitionUse {
 /// the environment has them; `Config` adds their normalisation.
 pub trait AlgorithmSettings {
     /// Its policy in an environment like `spec`, for at most `envs` observations a call, and how actors explore with
-    /// it.
+    /// it. `envs` is 0 if only the layout is needed.
     ///
     /// # Errors
     /// When it cannot control that environment.
     fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError>;
 
-    /// The networks or tables that it learns in an environment like `spec`.
+    /// The networks or tables that it learns in an environment like `spec`. `policy` has as many parameters as the
+    /// policy of `behaviour`. Names and shapes enter the run's identity, so they never change.
     fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes;
 
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.

@@ -35,7 +35,9 @@ pub struct EnvironmentConfig {
     #[serde(default = "default_faults", skip_serializing_if = "is_default_faults")]
     #[schemars(extend("unit" = "answers", "source" = "ours", "change" = Change::Anytime))]
     pub faults: u32,
-    /// How long the server may take to start. After 10 s the terminal shows which server the run waits for.
+    /// How long the server may take to start. After 10 s the terminal shows which server the run waits for. Where a
+    /// command asks the server itself (`eval`, `film`, `plot`, `report`, and the final evaluation), this is also the
+    /// limit of each reset and step.
     #[serde(default = "default_start_seconds", skip_serializing_if = "is_default_start_seconds")]
     #[schemars(extend("unit" = "s", "source" = "ours", "change" = Change::Anytime))]
     pub start_seconds: u32,

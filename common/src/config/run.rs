@@ -8,7 +8,7 @@ use shoal_base::section::{Change, OutOfRange, from, never};
 use super::identity_format::IdentityFormat;
 
 section! {
-    /// The run itself: id, seed, mode, length, origin, and patience with its processes.
+    /// The run itself: id, seed, mode, length, origin, and when its processes are stalled.
     pub struct RunConfig {
         /// Names the run's services and shared memory. Chosen by the program when the run directory is created.
         id: String = String::new(), unit: "–", source: "ours", change: Change::ByProgram;

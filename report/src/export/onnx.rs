@@ -41,7 +41,7 @@ pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
             let centre: Vec<f32> = elements.map(|element| range.action(element, 0.0)).collect();
             let outputs = half.len();
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
-            graph.add_network(network, "z");
+            graph.add_network(network, policy.starts.observation, "z");
             graph.add_node("Tanh", &["z"], "tanh", vec![]);
             graph.add_tensor("action_half_width", &[outputs], &half);
             graph.add_node("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
@@ -56,7 +56,7 @@ pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
         }
         PolicyFunction::Probabilities { network } => {
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
-            graph.add_network(network, "logits");
+            graph.add_network(network, policy.starts.observation, "logits");
             graph.add_node("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
             graph.add_arg_max("logits", policy.starts.action);
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
@@ -66,7 +66,7 @@ pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
         }
         PolicyFunction::Values { network } => {
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
-            graph.add_network(network, "action_values");
+            graph.add_network(network, policy.starts.observation, "action_values");
             graph.add_arg_max("action_values", policy.starts.action);
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
             graph.add_output("action_values", FLOAT, &[actions]);
@@ -109,8 +109,9 @@ pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
 }
 
 impl Graph {
-    /// Adds the layers with the activation between them. The output of the last layer is named `output`.
-    fn add_network(&mut self, network: &ExportedNetwork, output: &str) {
+    /// Adds the layers with the activation between them. The environment numbers discrete observations from `start` on,
+    /// the network from 0. The output of the last layer is named `output`.
+    fn add_network(&mut self, network: &ExportedNetwork, start: i32, output: &str) {
         let ExportedNetwork {
             normalisation,
             activation,
@@ -121,9 +122,19 @@ impl Graph {
             Activation::Tanh => "Tanh",
         };
         let mut x = "observation".to_owned();
+        if start != 0 {
+            self.add_tensor("observation_start", &[], &[start as f32]);
+            self.add_node(
+                "Sub",
+                &["observation", "observation_start"],
+                "observation_index",
+                vec![],
+            );
+            x = "observation_index".into();
+        }
         if let Some((mean, factor)) = normalisation {
             self.add_tensor("observation_mean", &[mean.len()], mean);
-            self.add_node("Sub", &["observation", "observation_mean"], "centred", vec![]);
+            self.add_node("Sub", &[&x, "observation_mean"], "centred", vec![]);
             self.add_tensor("observation_factor", &[factor.len()], factor);
             self.add_node(
                 "Mul",

@@ -16,7 +16,7 @@ use tempfile::TempDir;
 /// The program's name.
 const PROGRAM: &str = "ffmpeg";
 /// How long it may take for a picture, and to end after the last one.
-const PATIENCE: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// Checks that the program is there.
 ///
@@ -138,8 +138,8 @@ fn pause(since: Instant, interrupt: &Interrupt) -> anyhow::Result<()> {
     if let Some(signal) = interrupt.signal() {
         bail!("ended by {}", signals::describe(signal));
     }
-    if since.elapsed() > PATIENCE {
-        bail!("ffmpeg has not gone on for {} s", PATIENCE.as_secs());
+    if since.elapsed() > TIMEOUT {
+        bail!("ffmpeg has not gone on for {} s", TIMEOUT.as_secs());
     }
     std::thread::sleep(Duration::from_millis(5));
     Ok(())

@@ -69,6 +69,11 @@ impl Painter {
         }
     }
 
+    /// Takes note of the next state without painting it.
+    pub(crate) fn leave_out(&mut self, drawing: &Drawing) {
+        self.trail.extend(drawing.trail);
+    }
+
     /// Paints the next state. `None` if the drawing's view is empty.
     pub(crate) fn paint(&mut self, drawing: &Drawing) -> Option<Image> {
         self.trail.extend(drawing.trail);

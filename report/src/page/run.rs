@@ -28,7 +28,8 @@ pub(super) struct Run {
     /// The environment's name with its textual parameters, such as the reward.
     pub(super) environment: String,
     pub(super) algorithm: &'static str,
-    seed: u64,
+    /// As text: JavaScript's numbers have 53 bits.
+    seed: String,
     mode: Mode,
     state: PageState,
     /// Why it ended, if it did not simply finish.
@@ -148,7 +149,7 @@ impl Run {
             name,
             environment: environment_label(&config),
             algorithm: config.algorithm.name(),
-            seed: config.run.seed,
+            seed: config.run.seed.to_string(),
             mode: config.run.mode,
             state: match (is_training, is_finished) {
                 (true, _) => PageState::Training,

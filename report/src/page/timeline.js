@@ -7,6 +7,7 @@ const ROLES = [
   ["evaluator", "evaluator"],
   ["actor", "actors"],
   ["env-server", "environment servers"],
+  ["gate", "gate"],
 ];
 
 /** The words, colour and sign of each kind of incident. */

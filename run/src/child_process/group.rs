@@ -11,7 +11,7 @@ use rustix::process::{Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, kill_proce
 use super::wait_for_any;
 
 /// How long a killed process may take to disappear. It takes longer only while the kernel waits for a device.
-const KILL_PATIENCE: Duration = Duration::from_secs(5);
+const KILL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A child process that leads a process group. It is killed on drop. Its descriptor becomes readable when it has ended.
 #[derive(Debug)]
@@ -71,9 +71,9 @@ impl ChildGroup {
         self.ended
     }
 
-    /// Waits at most `patience` for its end; its exit status, if it has ended.
-    pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
-        let deadline = Instant::now() + patience;
+    /// Waits at most `timeout` for its end; its exit status, if it has ended.
+    pub fn wait(&mut self, timeout: Duration) -> Option<ExitStatus> {
+        let deadline = Instant::now() + timeout;
         loop {
             let status = self.exit_status();
             let left = deadline.saturating_duration_since(Instant::now());
@@ -101,7 +101,7 @@ impl ChildGroup {
 impl Drop for ChildGroup {
     fn drop(&mut self) {
         self.kill();
-        self.wait(KILL_PATIENCE);
+        self.wait(KILL_TIMEOUT);
     }
 }
 

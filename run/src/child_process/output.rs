@@ -16,7 +16,7 @@ const RATE: f64 = 256.0 * 1024.0;
 
 /// How long to wait for the last output of a process that has ended. It arrives at once unless another process keeps
 /// the pipe open.
-const LAST_OUTPUT: Duration = Duration::from_millis(500);
+const LAST_OUTPUT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Whose output it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,7 +66,7 @@ impl ChildOutput {
     /// Waits briefly until all output has been passed on.
     pub fn wait(&self) {
         // A timeout and the thread's end are both fine.
-        let _ = self.all_read.recv_timeout(LAST_OUTPUT);
+        let _ = self.all_read.recv_timeout(LAST_OUTPUT_TIMEOUT);
     }
 }
 

@@ -15,10 +15,10 @@ use shoal_common::run_dir::RunDir;
 use crate::child_process::{ChildGroup, ChildOutput, Line, Writer, role_command};
 
 /// How long a process may take to end in order. A learner writes its replay to the disk.
-const END_PATIENCE: Duration = Duration::from_secs(15);
+const END_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// How long a process whose state does not matter may take to end.
-const SHUT_DOWN_PATIENCE: Duration = Duration::from_secs(2);
+const SHUT_DOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Exit code of a launcher that SIGTERM has ended in order.
 const TERMINATED: i32 = 143;
@@ -128,7 +128,7 @@ impl ChildProcess {
     /// Asks the process to end, and waits for it.
     pub fn end(mut self) -> anyhow::Result<()> {
         self.ask_to_end();
-        match self.await_end(END_PATIENCE)? {
+        match self.await_end(END_TIMEOUT)? {
             status if status.success() => Ok(()),
             status => self.ended_early(status),
         }
@@ -136,29 +136,29 @@ impl ChildProcess {
 
     /// Ends a launcher with SIGTERM and waits for it. A launcher does not watch its standard input, and ignores SIGINT
     /// if this process was started in the background of a script.
-    pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
+    pub fn interrupt(mut self, timeout: Duration) -> anyhow::Result<()> {
         self.signal(Signal::TERM)?;
-        let status = self.await_end(patience)?;
+        let status = self.await_end(timeout)?;
         match status.code() {
             Some(0 | TERMINATED) => Ok(()),
             _ => self.ended_early(status),
         }
     }
 
-    /// Waits at most `patience` for its end; its exit status, if it has ended.
-    pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
-        self.group.wait(patience)
+    /// Waits at most `timeout` for its end; its exit status, if it has ended.
+    pub fn wait(&mut self, timeout: Duration) -> Option<ExitStatus> {
+        self.group.wait(timeout)
     }
 
-    fn await_end(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
-        let ended = self.group.wait(patience);
+    fn await_end(&mut self, timeout: Duration) -> anyhow::Result<ExitStatus> {
+        let ended = self.group.wait(timeout);
         ended.with_context(|| format!("the {} did not end when asked to", self.what))
     }
 
     /// Asks the process to end and waits briefly. If it does not end, it is killed on drop.
     pub fn shut_down(&mut self) {
         self.stdin = None;
-        self.group.wait(SHUT_DOWN_PATIENCE);
+        self.group.wait(SHUT_DOWN_TIMEOUT);
     }
 
     fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {

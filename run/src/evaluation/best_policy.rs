@@ -7,7 +7,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::{LockedRun, RunDir};
 
 use crate::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult};
-use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
+use crate::evaluation::{EpisodeSet, EvaluationSummary, SavedPolicy, evaluate_policy};
 use crate::signals::Interrupt;
 
 /// A policy with its final evaluation.
@@ -48,7 +48,14 @@ pub fn evaluate_and_keep_best(
         };
         progress(policy, 0);
         let progress = |finished: u32| progress(policy, finished);
-        let summary = evaluate_policy(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
+        let summary = evaluate_policy(
+            run,
+            config,
+            &file.parameters,
+            EpisodeSet { count: episodes, seed },
+            interrupt,
+            progress,
+        )?;
         candidates.push(Candidate { policy, file, summary });
     }
     let kept = better(&candidates).context("no policy has a finite return")?;

@@ -4,7 +4,7 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::LockedRun;
 
-use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
+use crate::evaluation::{EpisodeSet, EvaluationSummary, SavedPolicy, evaluate_policy};
 use crate::external_environment::GYMNASIUM;
 use crate::external_environment::server_location::ServerLocation;
 use crate::files::is_there;
@@ -58,8 +58,11 @@ pub fn reevaluate_best(
     let Some(best) = SavedPolicy::Best.read_if_any(run, config)? else {
         return Ok(None);
     };
-    let amount = (config.evaluation.episodes, config.run.seed);
-    let now = evaluate_policy(run, config, &best.parameters, amount, interrupt, |_| ())?;
+    let episodes = EpisodeSet {
+        count: config.evaluation.episodes,
+        seed: config.run.seed,
+    };
+    let now = evaluate_policy(run, config, &best.parameters, episodes, interrupt, |_| ())?;
     let updated = PolicyFile {
         return_mean: now.return_mean,
         return_std: now.return_std,

@@ -64,7 +64,7 @@ pub struct Rollout<'a> {
     environment: RolloutEnvironment,
     policy: Policy,
     parameters: &'a [f32],
-    surroundings: LaunchContext,
+    launch_context: LaunchContext,
     interrupt: Interrupt,
 }
 
@@ -102,7 +102,7 @@ impl<'a> Rollout<'a> {
             environment: RolloutEnvironment::new(config)?,
             policy,
             parameters,
-            surroundings: LaunchContext::default(),
+            launch_context: LaunchContext::default(),
             interrupt: Interrupt::default(),
         })
     }
@@ -110,7 +110,7 @@ impl<'a> Rollout<'a> {
     /// As [`new`](Self::new), for a run: an environment that another program serves is started as in training.
     pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         Ok(Self {
-            surroundings: LaunchContext::of_run(run, config)?,
+            launch_context: LaunchContext::of_run(run, config)?,
             ..Self::new(config, parameters)?
         })
     }
@@ -122,7 +122,7 @@ impl<'a> Rollout<'a> {
 
     /// Asks an environment that another program serves for pictures, at most this many pixels high.
     pub fn with_pictures(mut self, height: u32) -> Self {
-        self.surroundings.picture_height = Some(height);
+        self.launch_context.picture_height = Some(height);
         self
     }
 
@@ -190,7 +190,7 @@ impl<'a> Rollout<'a> {
         self.environment.ask_for_picture()?;
         let mut observation = self
             .environment
-            .begin(self.config, &self.surroundings, reset, &self.interrupt)?;
+            .begin(self.config, &self.launch_context, reset, &self.interrupt)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
@@ -264,7 +264,7 @@ impl RolloutEnvironment {
     fn begin(
         &mut self,
         config: &Config,
-        surroundings: &LaunchContext,
+        launch_context: &LaunchContext,
         reset: Reset<'_>,
         interrupt: &Interrupt,
     ) -> anyhow::Result<Vec<f32>> {
@@ -280,8 +280,8 @@ impl RolloutEnvironment {
                     *server = None;
                 }
                 let begin = || {
-                    let (surroundings, interrupt) = (surroundings.clone(), interrupt.clone());
-                    let begun = ExternalEnvironment::begin_in(&config.environment, 1, seed, surroundings, interrupt)?;
+                    let (launch_context, interrupt) = (launch_context.clone(), interrupt.clone());
+                    let begun = ExternalEnvironment::begin_in(&config.environment, 1, seed, launch_context, interrupt)?;
                     check_spec(config, begun.spec())?;
                     anyhow::Ok((seed, Box::new(begun)))
                 };

@@ -151,7 +151,7 @@ pub struct LaunchContext {
 }
 
 impl LaunchContext {
-    /// The surroundings of a run's server.
+    /// The launch context of a run's server.
     ///
     /// # Errors
     /// As for [`ServerLocation::of_run`].

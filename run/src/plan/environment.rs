@@ -48,12 +48,12 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
     };
     let (environment, spec, description) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let surroundings = LaunchContext {
+        let launch_context = LaunchContext {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
             picture_height: None,
         };
-        let served = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?;
+        let served = ExternalEnvironment::begin_in(&environment, 1, 0, launch_context, Interrupt::default())?;
         (environment, served.spec().clone(), served.description()?)
     } else {
         let parameters = environment::resolve(&name, section)?;

@@ -114,7 +114,7 @@ impl RunOverrides {
     ///
     /// # Errors
     /// When the current directory is unknown.
-    pub fn demonstrations_from_anywhere(&self) -> anyhow::Result<Option<String>> {
+    pub fn absolute_dataset(&self) -> anyhow::Result<Option<String>> {
         let absolute = |dataset: &String| match Path::new(dataset).is_dir() {
             true => Ok(std::path::absolute(dataset)?.display().to_string()),
             false => Ok(dataset.clone()),

@@ -84,7 +84,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;
     set_from_predecessor(&mut table, &mut sources, overrides)?;
-    if let Some(dataset) = overrides.demonstrations_from_anywhere()? {
+    if let Some(dataset) = overrides.absolute_dataset()? {
         put(&mut table, &["run", "demonstrations"], dataset.into())?;
     }
     let mut config = Config::from_settings(&table).map_err(|error| sources.explain(error.to_string(), what, &table))?;

@@ -19,6 +19,7 @@ use toml::Table;
 use super::overrides::{RunOverrides, read_counts, set_key, set_options};
 use super::resolve::set_from_length;
 use super::source::{SettingSource, SettingSources};
+use crate::files::is_there;
 use crate::plan::algorithm;
 use crate::records::recorder::{ChangeRecord, Moment, read_changes, record_changes};
 use crate::status::{replay_rows, saved_status};
@@ -131,7 +132,7 @@ impl Revision {
         if !rows.is_empty() {
             record_changes(run, &rows)?;
         }
-        if !self.changes.is_empty() || !run.used_config_file().exists() {
+        if !self.changes.is_empty() || !is_there(&run.used_config_file())? {
             run.write_used_config(&self.config)?;
         }
         Ok(rows)

@@ -160,10 +160,12 @@ impl Recorder {
         let earlier = learned.last().map_or(0.0, |row| row.wall_seconds);
         // Not the last rows: in records of earlier versions the steps may have fallen.
         let env_steps = learned.iter().map(|row| row.env_steps).max().unwrap_or(0);
-        let explored = read_episodes(&run.episodes())?;
-        let episode_steps = explored.iter().map(|row| row.env_steps).max().unwrap_or(0);
+        let mut episode_steps = 0;
+        table::for_each_row(&run.episodes(), |row: EpisodeRecord| {
+            episode_steps = episode_steps.max(row.env_steps);
+        })?;
         let newest = env_steps.max(episode_steps).max(evaluated.unwrap_or(0));
-        let continues = (!learned.is_empty()).then_some(newest + 1);
+        let continues = (!learned.is_empty()).then_some(newest.saturating_add(1));
         let events = EventFile::create(&run.tensorboard(), continues).map_err(|cause| RecordError::Write {
             path: run.tensorboard(),
             cause,
@@ -374,7 +376,8 @@ pub fn read_learner(path: &Path) -> Result<Vec<LearnerRecord>, RecordError> {
 
 /// The rows of an `incidents.csv`; `None` if there is no such file, as in runs of earlier versions.
 pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordError> {
-    path.exists().then(|| table::rows(path)).transpose()
+    let is_missing = matches!(path.try_exists(), Ok(false));
+    (!is_missing).then(|| table::rows(path)).transpose()
 }
 
 /// Environment steps and episodes of a run, by the last row of its `learner.csv`; `None` before the first row.

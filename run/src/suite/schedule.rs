@@ -14,6 +14,7 @@ use super::configuration::{overrides_of, requested};
 use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
 use crate::child_process::tied;
+use crate::files::is_there;
 use crate::interrupted_start::remove_interrupted_start;
 use crate::jobs::{TrainingEnd, run_jobs, run_training, trainings_for_all_cores};
 use crate::plan::{self, Revision, RunOverrides};
@@ -218,7 +219,7 @@ fn train_one(
 ) -> anyhow::Result<TrainingEnd> {
     let run = directory.join(&trial.name);
     let mut command = Command::new("/proc/self/exe");
-    if run.exists() {
+    if is_there(&run)? {
         command.arg("resume").arg(&run);
     } else {
         command.arg("train").arg(&suite.what);

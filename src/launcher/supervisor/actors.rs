@@ -104,7 +104,7 @@ impl Supervisor {
     pub(super) fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
         let missing = self.missing();
-        self.reserve_incarnations(missing.len() as u64)?;
+        self.incarnations.reserve(missing.len() as u64)?;
         for (role, index) in missing {
             self.children.push(Child::new(role, index));
             self.start(self.children.len() - 1)?;

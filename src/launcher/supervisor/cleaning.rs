@@ -10,9 +10,9 @@ use crate::launcher::log::Log;
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 
-/// How long dead processes may keep occupying shared memory in spite of clean-ups. A killed process may take a moment to
-/// disappear.
-const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
+/// How long dead processes may keep occupying shared memory in spite of clean-ups. A killed process may take a moment
+/// to disappear.
+const OCCUPIED_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// How soon a clean-up is repeated while they do.
 const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
@@ -69,7 +69,7 @@ impl Cleaning {
             return true;
         }
         let since = *self.occupied_since.get_or_insert(begun);
-        cleaned.is_err() || since.elapsed() < OCCUPIED_PATIENCE
+        cleaned.is_err() || since.elapsed() < OCCUPIED_TIMEOUT
     }
 
     /// The time spent on clean-ups since the last call.

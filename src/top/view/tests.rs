@@ -6,26 +6,26 @@ use super::super::RunEvent;
 use super::*;
 
 fn status() -> RunStatus {
-    let role = |role: &str, index, state, rate| RoleStatus {
-        role: role.into(),
+    let role = |role, index, state, rate| RoleStatus {
+        role,
         index,
         pid: Some(1_000 + index),
         state,
         restarts: 1,
         rate,
-        policy_version: (role != "env-server").then_some(12_345),
-        policy_lag: (role == "actor").then_some(3),
+        policy_version: (role != Role::EnvServer).then_some(12_345),
+        policy_lag: (role == Role::Actor).then_some(3),
     };
     let working = RoleState::Working;
     RunStatus {
         roles: vec![
-            role("learner", 0, working, 523.0),
-            role("env-server", 16, working, 0.0),
-            role("evaluator", 0, RoleState::WaitingForPeer, 0.0),
-            role("env-server", 0, working, 262.0),
-            role("actor", 0, RoleState::WaitingForRatio, 262.0),
-            role("env-server", 1, working, 261.0),
-            role("actor", 1, RoleState::Restarting, 0.0),
+            role(Role::Learner, 0, working, 523.0),
+            role(Role::EnvServer, 16, working, 0.0),
+            role(Role::Evaluator, 0, RoleState::WaitingForPeer, 0.0),
+            role(Role::EnvServer, 0, working, 262.0),
+            role(Role::Actor, 0, RoleState::WaitingForRatio, 262.0),
+            role(Role::EnvServer, 1, working, 261.0),
+            role(Role::Actor, 1, RoleState::Restarting, 0.0),
         ],
         env_steps: 60_000,
         steps: 120_000,

@@ -184,7 +184,7 @@ pub enum ControlResponse {
 impl RunStatus {
     /// Whether the number of actors is right and all of them have started.
     pub fn all_actors_work(&self) -> bool {
-        let mut actors = self.roles.iter().filter(|role| role.role == Role::Actor.name());
+        let mut actors = self.roles.iter().filter(|role| role.role == Role::Actor);
         actors.clone().count() == self.actors as usize
             && !actors.any(|actor| {
                 matches!(
@@ -200,7 +200,7 @@ impl RunStatus {
 pub struct RunStatus {
     /// Every process of the run.
     pub roles: Vec<RoleStatus>,
-    /// Environment steps learned from.
+    /// Environment steps that count for the ratio: all committed ones, in lockstep those of complete rounds.
     pub env_steps: u64,
     /// Environment steps after which training ends.
     pub steps: u64,
@@ -237,8 +237,9 @@ pub struct RunStatus {
 /// The status of a process of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoleStatus {
-    /// The name of its role.
-    pub role: String,
+    /// Its role, in messages by name.
+    #[serde(with = "role_name")]
+    pub role: Role,
     /// Its index among the processes of that role.
     pub index: u32,
     /// Its process id, if it is running.
@@ -253,6 +254,22 @@ pub struct RoleStatus {
     pub policy_version: Option<u64>,
     /// How many versions its policy is behind the learner's.
     pub policy_lag: Option<u64>,
+}
+
+mod role_name {
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serializer};
+    use shoal_base::role::Role;
+
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires this signature")]
+    pub(super) fn serialize<S: Serializer>(role: &Role, to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_str(role.name())
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Role, D::Error> {
+        let name = String::deserialize(from)?;
+        Role::from_name(&name).ok_or_else(|| D::Error::custom(format!("there is no role {name:?}")))
+    }
 }
 
 /// The state of a process of a run.
@@ -313,7 +330,7 @@ mod tests {
     fn status() -> RunStatus {
         RunStatus {
             roles: vec![RoleStatus {
-                role: "actor".into(),
+                role: Role::Actor,
                 index: 3,
                 pid: Some(77),
                 state: RoleState::WaitingForRatio,

@@ -3,7 +3,7 @@ use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::policy_file::PolicyFile;
 
-use super::super::tests_support::{policies, some_observations, with_starts};
+use super::super::tests_support::{policies, some_observations, with_observed_indices, with_starts};
 use super::*;
 
 /// The output that an independent ONNX runtime computes from the observations.
@@ -98,6 +98,19 @@ fn states_and_actions_are_counted_as_the_environment_counts_them() {
     let chosen = computed(&model, &config, &states, "action");
     let (_, chosen) = chosen.into_shape_vec::<i32, 1>().unwrap();
     assert_eq!(chosen, expected.iter().map(|a| *a as i32 + 5).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_network_sees_indices_that_are_counted_from_0() {
+    let (config, policy) = with_observed_indices();
+    let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
+    let model = Model::load(bytes).unwrap();
+    let indices = some_observations(&config, 33);
+    let observed: Vec<f32> = indices.iter().map(|index| index + 5.0).collect();
+    let mut expected = vec![0.0; 33];
+    let mut ours = config.policy(33).unwrap();
+    ours.act(&policy.parameters, &indices, &mut expected);
+    assert_close(&computed_floats(&model, &config, &observed, "action").1, &expected);
 }
 
 #[test]

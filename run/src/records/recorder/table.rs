@@ -118,26 +118,42 @@ impl Table {
     }
 }
 
-/// All rows of the table at `path`; empty if there is no file. A last line without a newline does not count.
-pub(super) fn rows<Row: DeserializeOwned>(path: &Path) -> Result<Vec<Row>, RecordError> {
+/// Reads the table at `path` row by row: it may be larger than the memory. There are no rows if there is no file. A last
+/// line without a newline does not count.
+pub(super) fn for_each_row<Row: DeserializeOwned>(path: &Path, mut take: impl FnMut(Row)) -> Result<(), RecordError> {
     let read = |cause| RecordError::Read {
         path: path.to_owned(),
         cause,
     };
-    let mut text = match std::fs::read_to_string(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        text => text.map_err(read)?,
+    let mut file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        file => file.map_err(read)?,
     };
-    text.truncate(text.rfind('\n').map_or(0, |end| end + 1));
-    let rows = csv::Reader::from_reader(text.as_bytes())
-        .into_deserialize()
-        .collect::<Result<_, _>>();
-    rows.map_err(|error| malformed(path, &error))
+    let end = whole_lines(&file)
+        .and_then(|end| file.rewind().map(|()| end))
+        .map_err(read)?;
+    let rows = csv::Reader::from_reader(BufReader::with_capacity(BUFFER, file.take(end)));
+    for row in rows.into_deserialize() {
+        take(row.map_err(|error| match error.is_io_error() {
+            true => read(io::Error::other(error)),
+            false => malformed(path, &error),
+        })?);
+    }
+    Ok(())
+}
+
+/// All rows of the table at `path`, as [`for_each_row`] reads them.
+pub(super) fn rows<Row: DeserializeOwned>(path: &Path) -> Result<Vec<Row>, RecordError> {
+    let mut rows = Vec::new();
+    for_each_row(path, |row| rows.push(row))?;
+    Ok(rows)
 }
 
 /// The last row of the table at `path`.
 pub(super) fn last<Row: DeserializeOwned>(path: &Path) -> Result<Option<Row>, RecordError> {
-    rows(path).map(|mut rows: Vec<Row>| rows.pop())
+    let mut last = None;
+    for_each_row(path, |row| last = Some(row))?;
+    Ok(last)
 }
 
 /// The length in bytes of the complete lines.
