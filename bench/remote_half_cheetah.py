@@ -6,7 +6,7 @@
 
 Two network namespaces are the hosts. The cable between them (`tests/hosts/slow_cable.py`) delays each packet. The
 processes of each host are bound to one core. Both hosts have one actor with one HalfCheetah-v5; the learner makes a
-gradient step in 50 environment steps, so that nobody waits for it. It needs root, iproute2 and /dev/net/tun.
+gradient step in 500 environment steps, so that nobody waits for it. It needs root, iproute2 and /dev/net/tun.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from pathlib import Path
 
 SLOW_CABLE = Path(__file__).parent.parent / "tests" / "hosts" / "slow_cable.py"
 ENVIRONMENT = "gym:HalfCheetah-v5"
-SETTINGS = {"actors.envs": 1, "replay.updates_per_step": 0.02, "evaluation.every": 1_000_000, "learner.threads": 1}
+SETTINGS = {"actors.envs": 1, "replay.updates_per_step": 0.002, "evaluation.every": 1_000_000, "learner.threads": 1}
 LEARNER, OTHER = 0, 1
 PORT = 7447
 START_SECONDS, MEASURED_FROM = 60, 5
