@@ -51,8 +51,9 @@ const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 /// How often the launcher gets the status of the hosts.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How long the channels of a released host's actors last while the learner has not committed what they hold.
-const RELEASED_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long the channels of a released host's actors last while the learner has not committed what they hold. It is
+/// shorter than the learner's host waits for them (`CLAIM_TIMEOUT`), if it has these actors now.
+const RELEASED_TIMEOUT: Duration = Duration::from_secs(4);
 
 /// How long the hosts may take to hand over what they have when the run is over.
 const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
@@ -587,10 +588,16 @@ impl<'a> Gate<'a> {
     }
 
     /// Forgets the actors of released hosts when what was forwarded is committed: a new learner would need the history
-    /// of their channels. After a while it forgets them anyway, because the learner's host may have these actors now.
+    /// of their channels. Those that the learner's host may have now are forgotten after a while anyway. In lockstep
+    /// they are forgotten at once: an unfinished round is collected again.
     fn forget_released(&mut self) {
-        self.actors.retain(|_, actor| {
-            let may_be_needed = |since: Instant| actor.forwarding.is_waiting() && since.elapsed() < RELEASED_TIMEOUT;
+        let config = &self.settings.config;
+        self.actors.retain(|index, actor| {
+            let may_be_needed = |since: Instant| {
+                config.run.mode == Mode::Free
+                    && actor.forwarding.is_waiting()
+                    && (!config.actors.has_own_service(*index) || since.elapsed() < RELEASED_TIMEOUT)
+            };
             actor.released_at.is_none_or(may_be_needed)
         });
     }
