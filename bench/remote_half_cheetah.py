@@ -24,7 +24,7 @@ ENVIRONMENT = "gym:HalfCheetah-v5"
 SETTINGS = {"actors.envs": 1, "replay.updates_per_step": 0.002, "evaluation.every": 1_000_000, "learner.threads": 1}
 LEARNER, OTHER = 0, 1
 PORT = 7447
-START_SECONDS, MEASURED_FROM = 60, 5
+TIMEOUT_SECONDS, MEASURED_FROM = 60, 5
 
 WAITED = re.compile(r"^actor-1 .*waited_us=(\d+)")
 
@@ -47,10 +47,10 @@ def command(host, *arguments):
 
 
 def until(what, condition):
-    deadline = time.monotonic() + START_SECONDS
+    deadline = time.monotonic() + TIMEOUT_SECONDS
     while not condition():
         if time.monotonic() > deadline:
-            sys.exit(f"waited {START_SECONDS} s for this in vain: {what}")
+            sys.exit(f"waited {TIMEOUT_SECONDS} s for this in vain: {what}")
         time.sleep(0.1)
 
 
@@ -77,25 +77,25 @@ def measure(program, seconds):
             join = [program, "join", endpoint, "--key", run / "join.key", "--actors", "1", "--local", place]
             hosts.append(subprocess.Popen(command(OTHER, *join), **quiet))
 
-            def steps():
+            def rows_per_second():
                 there = ["nsenter", "--target", str(learner.pid), "--mount", "--net"]
                 output = subprocess.run([*there, program, "status", run, "--json"], capture_output=True, text=True)
                 known = json.loads(output.stdout)["hosts"] if output.returncode == 0 else []
                 return known[0]["rows_per_second"] if known else 0
 
-            until("rows of the other host arrive", lambda: steps() > 0)
+            until("rows of the other host arrive", lambda: rows_per_second() > 0)
             time.sleep(MEASURED_FROM)
             before, begun, rates = len(waits(place / "shoal.log")), time.monotonic(), []
             while time.monotonic() < begun + seconds:
                 time.sleep(1)
-                rates.append(steps())
+                rates.append(rows_per_second())
             length = time.monotonic() - begun
             found = waits(place / "shoal.log")[before:]
         finally:
             for host in hosts:
                 host.terminate()
             for host in hosts:
-                host.wait()
+                host.wait(TIMEOUT_SECONDS)
         return sum(found) / length, max(found, default=0), sum(rates) / len(rates)
 
 
