@@ -39,6 +39,9 @@ pub const GYMNASIUM: &str = "gym:";
 /// How long a program may take to end after it has left shared memory.
 const END_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// From this variable numeric libraries (OpenBLAS, MKL, PyTorch) read how many threads each of their processes uses.
+const COMPUTE_THREADS: &str = "OMP_NUM_THREADS";
+
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
 
@@ -84,6 +87,9 @@ pub struct LaunchSpec<'a> {
 
 impl LaunchSpec<'_> {
     /// The command that starts the server; `None` for a built-in environment.
+    ///
+    /// Numeric libraries in it use one thread unless the user's environment says otherwise: by default each server would
+    /// use all cores, and results may depend on their number.
     pub fn command(&self, environment: &EnvironmentConfig) -> anyhow::Result<Option<Command>> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
@@ -101,6 +107,9 @@ impl LaunchSpec<'_> {
         };
         if let Some(seed) = hash_seed {
             command.env("PYTHONHASHSEED", seed.to_string());
+        }
+        if std::env::var_os(COMPUTE_THREADS).is_none() {
+            command.env(COMPUTE_THREADS, "1");
         }
         match &self.pictures {
             Some((file, height)) => command

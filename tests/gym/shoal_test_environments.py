@@ -65,7 +65,8 @@ class Tells(Ends):
     def __init__(self, **arguments):
         super().__init__(after=0)
         with open("told", "a") as told:
-            told.write(f"{os.environ.get('PYTHONHASHSEED')} {sorted(arguments.items())}\n")
+            variables = [os.environ.get(name) for name in ("PYTHONHASHSEED", "OMP_NUM_THREADS")]
+            told.write(f"{' '.join(map(str, variables))} {sorted(arguments.items())}\n")
 
 
 class Talks(Ends):
