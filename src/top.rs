@@ -1,10 +1,12 @@
 //! The state and the view of `shoal top`. `command/top.rs` handles the terminal and its keys.
 
+mod keys;
 mod link;
 mod view;
 
 use std::collections::VecDeque;
 
+pub(crate) use keys::{Key, keys};
 pub(crate) use link::{LauncherLink, Request, RunEvent};
 use shoal_common::channel::control::RunStatus;
 pub(crate) use view::draw;

@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 use ratatui::DefaultTerminal;
-use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use ratatui::layout::Size;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_common::config::{Config, Mode};
@@ -19,7 +19,7 @@ use shoal_run::signals::{Signals, exit_code};
 use signal_hook::consts::SIGHUP;
 
 use super::status::show_saved;
-use crate::top::{LauncherLink, Screen, draw};
+use crate::top::{Key, LauncherLink, Screen, draw, keys};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TopArgs {
@@ -78,13 +78,15 @@ fn show(
     signal: &AtomicUsize,
 ) -> anyhow::Result<()> {
     let mut changed = true;
+    let mut size = Size::ZERO;
     while signal.load(Ordering::Relaxed) == 0 {
-        if changed {
+        let now = terminal.size().context("cannot ask for the size of this terminal")?;
+        if changed || now != size {
             terminal
                 .draw(|frame| draw(frame, screen))
                 .context("cannot draw on this terminal")?;
         }
-        changed = false;
+        (changed, size) = (false, now);
         match wait_for_input()? {
             Input::Nothing => {}
             Input::Something => {
@@ -117,8 +119,7 @@ fn wait_for_input() -> anyhow::Result<Input> {
     let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
     let tick = Timespec::try_from(TICK).context("cannot wait for the keyboard")?;
     match poll(&mut fds, Some(&tick)) {
-        // A signal: the size of the terminal may have changed.
-        Err(Errno::INTR) => return Ok(Input::Something),
+        Err(Errno::INTR) => return Ok(Input::Nothing),
         polled => polled.context("cannot wait for the keyboard")?,
     };
     let events = fds[0].revents();
@@ -133,28 +134,25 @@ fn wait_for_input() -> anyhow::Result<Input> {
     )
 }
 
-/// Handles the keys that were pressed; returns whether one of them quits.
+/// Handles the keys that were pressed; returns whether one of them quits. There must be input.
 fn read_keys(screen: &mut Screen, link: &LauncherLink) -> anyhow::Result<bool> {
-    while event::poll(Duration::ZERO).context("cannot read the keyboard")? {
-        let Event::Key(key) = event::read().context("cannot read the keyboard")? else {
-            continue;
-        };
-        if is_quit_key(&key) {
-            return Ok(true);
-        }
-        // Any key closes an open box, so other keys count as a space.
-        let pressed = key.code.as_char().filter(|_| key.kind == KeyEventKind::Press);
-        if let Some(request) = screen.press(pressed.unwrap_or(' ')) {
-            link.request(request);
+    let mut bytes = [0; 256];
+    let count = match rustix::io::read(std::io::stdin(), &mut bytes) {
+        Err(Errno::INTR) => return Ok(false),
+        Ok(0) => bail!("the keyboard is closed"),
+        read => read.context("cannot read the keyboard")?,
+    };
+    for key in keys(&bytes[..count]) {
+        match key {
+            Key::Quit => return Ok(true),
+            Key::Char(char) => {
+                if let Some(request) = screen.press(char) {
+                    link.request(request);
+                }
+            }
         }
     }
     Ok(false)
-}
-
-/// Whether the key is `q` or Ctrl-C, which arrives as a key here.
-fn is_quit_key(key: &KeyEvent) -> bool {
-    let control = key.modifiers.contains(KeyModifiers::CONTROL);
-    matches!(key.code, KeyCode::Char('q')) || (control && matches!(key.code, KeyCode::Char('c')))
 }
 
 /// The number of the signal that has arrived; 0 if none has. Ends the process if the main loop hangs after a signal.

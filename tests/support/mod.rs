@@ -387,7 +387,10 @@ impl Drop for Running {
 impl Drop for Workplace {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!("standard error of the run: {}", self.stderr());
+            let said = self.stderr();
+            let lines: Vec<&str> = said.lines().collect();
+            let shown = &lines[lines.len().saturating_sub(SHOWN_LINES)..];
+            eprintln!("standard error of the run:\n{}", shown.join("\n"));
         }
         let _ = Domain::remove_abandoned();
     }

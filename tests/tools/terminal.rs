@@ -151,8 +151,12 @@ fn window(rows: u16, columns: u16) -> Winsize {
     }
 }
 
+#[allow(clippy::print_stderr, reason = "a failed test explains itself")]
 impl Drop for Terminal {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("the terminal:\n{}", self.text());
+        }
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -23,6 +23,14 @@ fn top_shows_scales_and_stops_a_run() {
     until("the help is gone", || !terminal.text().contains("one actor more"));
     terminal.resize(10, 40);
     terminal.shows("more");
+    // A key together with a change of the size.
+    for rows in 0..20 {
+        terminal.resize(30 + rows, 100);
+        terminal.press("?");
+        terminal.shows("one actor more");
+        terminal.press("x");
+        until("the help is gone", || !terminal.text().contains("one actor more"));
+    }
     terminal.resize(60, 200);
     terminal.shows("env-server 16");
     running.kill("actor-0");
