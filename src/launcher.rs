@@ -4,12 +4,13 @@ mod child;
 mod cleaner;
 mod end_roles;
 mod incarnations;
+mod joined_hosts;
 #[cfg_attr(
     not(feature = "remote"),
     expect(dead_code, reason = "only `join` uses it, which is not built")
 )]
-pub(crate) mod joined;
-mod joined_hosts;
+pub(crate) mod joined_launcher;
+mod local_actors;
 mod log;
 mod process;
 mod progress;
@@ -57,8 +58,11 @@ const LOW_FILL: f64 = 0.1;
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
 const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(1);
 
+/// Why a request that needs roles is not carried out while they end and the run may continue with others.
+const ROLES_END: &str = "the processes of the run are ending";
+
 /// How long actors of a run that is stopped wait until everything is committed, even while there is no learner.
-const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(2);
+const ACTORS_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long actors may take to end after that. In a run that was not stopped, this is all the time they have.
 const ACTORS_END_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long the other roles may take to end. The learner saves its state in this time.
@@ -225,11 +229,14 @@ fn run_once(
     signals: &Signals,
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome<RolesEnd>> {
+    run.check()?;
     let saved = status::saved_status(&config, run)?;
     let starts =
         RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(OutcomeReason::Starting);
     starts.write(run)?;
     wait_for_predecessors(&config.run.id, run)?;
+    // The wait may have been long: by now another run may be at its place.
+    run.check()?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max_on_a_host())?;
     let outcome = preflight::reserve(&config, run, &domain)
@@ -259,12 +266,11 @@ fn original_run(error: &DomainError, run: &RunDir) -> Option<String> {
         return None;
     };
     // Only roles name their directory in a fixed place: their arguments are role, run directory and two numbers.
-    let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner, Role::Gate].map(Role::name);
     let directory = |pid: &i32| {
         let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
         let arguments = String::from_utf8_lossy(&arguments);
         let mut arguments = arguments.split('\0').skip(1);
-        let is_role = roles.contains(&arguments.next()?);
+        let is_role = Role::from_name(arguments.next()?).is_some();
         arguments.next().filter(|_| is_role).map(str::to_owned)
     };
     let here = run.path().display().to_string();
@@ -432,6 +438,7 @@ impl<'a> Launcher<'a> {
     }
 
     fn watch(&mut self) -> anyhow::Result<RolesEnd> {
+        self.run.check()?;
         self.supervisor.start_all(self.domain)?;
         loop {
             self.take_signal();
@@ -525,7 +532,7 @@ impl<'a> Launcher<'a> {
         // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
         if was_asked && self.config.run.mode == Mode::Free {
             self.supervisor.ask_to_retire(Role::Actor);
-            self.have_ended_within(HAND_OVER_TIMEOUT, |role| role == Role::Actor, receiver);
+            self.have_ended_within(ACTORS_HAND_OVER_TIMEOUT, |role| role == Role::Actor, receiver);
         }
         self.supervisor.ask_to_end(|role| role == Role::Actor);
         self.await_end(|role| role == Role::Actor, ACTORS_END_TIMEOUT, receiver);
@@ -633,7 +640,9 @@ impl EndRoles for Launcher<'_> {
                         },
                     )),
                     ControlRequest::Scale(_) if *phase == Phase::RunEnds => Ok(Some(ControlResponse::RunIsEnding)),
-                    ControlRequest::Scale(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
+                    ControlRequest::Scale(_) if *phase == Phase::RolesEnd => Ok(Some(ControlResponse::Refused(
+                        format!("{ROLES_END}; try again when it continues"),
+                    ))),
                     ControlRequest::Scale(request) => requests::scale(config, run, supervisor, &request, now).map(Some),
                     ControlRequest::Admit(_)
                         if *phase == Phase::RunEnds
@@ -641,8 +650,15 @@ impl EndRoles for Launcher<'_> {
                     {
                         Ok(Some(ControlResponse::RunIsEnding))
                     }
-                    ControlRequest::Admit(_) if *phase == Phase::RolesEnd => Ok(Some(roles_are_ending())),
-                    ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
+                    ControlRequest::Admit(_) if *phase == Phase::RolesEnd => {
+                        Ok(Some(ControlResponse::NotNow(ROLES_END.into())))
+                    }
+                    // As when too many files are open.
+                    ControlRequest::Admit(request) => Ok(Some(
+                        supervisor
+                            .admit(domain, request)
+                            .unwrap_or_else(|error| ControlResponse::NotNow(one_line(error))),
+                    )),
                     ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
                     ControlRequest::Replace { .. } | ControlRequest::JoinAgain(_) => {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
@@ -664,11 +680,6 @@ impl EndRoles for Launcher<'_> {
             self.tick = SHORTEST_TICK;
         }
     }
-}
-
-/// The answer to a request that needs roles, while they end and the run may continue with others.
-fn roles_are_ending() -> ControlResponse {
-    ControlResponse::Refused("the processes of the run are ending; try again when it continues".into())
 }
 
 /// Passes all received reports to `handle`. Returns the fraction of one sender's buffer that they would fill.

@@ -10,7 +10,7 @@ use std::path::Path;
 use std::process::Output;
 
 use serde_json::Value;
-use shoal_common::config::Config;
+use shoal_common::config::{AlgorithmConfig, Config, ReturnWeighting};
 use shoal_run::testing::dataset;
 use support::{Workplace, error_line, json};
 
@@ -169,6 +169,11 @@ fn a_run_takes_the_replay_along_and_counts_its_steps_from_there() {
         String::from_utf8_lossy(&output.stderr)
     );
 
+    // Of another run's configuration, only its own steps count.
+    let output = place.output(&["train", "new/config.toml", "--run", "third", "--quiet"]);
+    assert!(output.status.success(), "{}", error_line(&output));
+    assert_eq!(config(&place.path().join("third")).run.steps, 300);
+
     let other = [
         &arguments[..],
         &["--run", "faster", "--set", "environment.start_speed=1"],
@@ -206,6 +211,10 @@ fn what_does_not_fit_is_refused_and_leaves_no_run() {
             "its networks have another shape: ddpg.hidden = [24, 16]",
         ),
         (
+            &["pendulum", "--from", "old", "--set", "observation.normalise=true"],
+            "its networks have another shape: observation.normalise = false",
+        ),
+        (
             &["point-mass-r1", "--from", "old"],
             "its networks are for other observations",
         ),
@@ -238,6 +247,30 @@ fn what_does_not_fit_is_refused_and_leaves_no_run() {
     running.wait_for_learning();
     let (message, _) = refused(&["pendulum", "--from", "running", "--with-replay"]);
     assert!(message.contains("is running, and its replay with it"), "{message}");
+}
+
+#[test]
+fn exploration_and_the_kind_of_networks_follow_the_run_that_a_new_one_begins_with() {
+    let begun = |preset: &str, old: &[&str], new: &[&str]| {
+        let place = Workplace::new();
+        let output = place.output(&[&["train", preset, "--run", "old", "--quiet"], old].concat());
+        assert!(output.status.success(), "{}", error_line(&output));
+        begin(&place, preset, &[&["--run", "new", "--quiet"], new].concat());
+        config(&place.path().join("new")).algorithm
+    };
+    let size = ["--method", "dqn", "--set", "dqn.hidden=[8]", "--set", "dqn.batch=8"];
+    let old = [&size[..], &["--steps", "200", "--set", "dqn.epsilon_end=0.2"]].concat();
+    let new = ["--method", "dqn", "--steps", "100", "--set", "dqn.batch=8"];
+    let AlgorithmConfig::Dqn(dqn) = begun("cart-pole", &old, &new) else {
+        panic!("another algorithm")
+    };
+    assert_eq!((dqn.epsilon_start, dqn.epsilon_end), (0.2, 0.05));
+
+    let old = ["--episodes", "3", "--set", "reinforce.weight=baseline"];
+    let AlgorithmConfig::Reinforce(reinforce) = begun("cart-pole", &old, &["--episodes", "3"]) else {
+        panic!("another algorithm")
+    };
+    assert_eq!(reinforce.weight, ReturnWeighting::Baseline);
 }
 
 /// Rows of a pendulum: s, a, r, whether it was terminated, s', last.

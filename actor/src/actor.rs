@@ -41,8 +41,8 @@ use crate::n_step::NStepTransitions;
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The time in which an actor reports at most half as many episodes as their channel holds. A launcher that may get so
-/// many reads them twice in this time.
+/// In this time an actor reports at most half as many episodes as their channel holds. The launcher reads the channel
+/// at least twice in it, so that no report is lost.
 const REPORT_SPAN: Duration = Duration::from_millis(40);
 
 /// The settings of an actor.
@@ -53,13 +53,13 @@ pub struct ActorSettings {
     /// The run's configuration. In lockstep, the actor waits for the policy of each round.
     pub config: Config,
     /// Environments stepped at once.
-    pub envs: usize,
+    envs: usize,
     /// Steps of a transition.
-    pub n_step: usize,
+    n_step: usize,
     /// The layout of a chunk.
-    pub chunk: ChunkLayout,
+    chunk: ChunkLayout,
     /// Whether the first policy comes from another run (`--from`).
-    pub starts_with_learned_policy: bool,
+    starts_with_learned_policy: bool,
     /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
 }
@@ -165,23 +165,15 @@ impl<'a> Actor<'a> {
             incarnation,
         );
         let exploration = Exploration::new(settings.config.behaviour(settings.envs)?, settings.envs, stream);
-        let snapshot = if settings.config.run.mode == Mode::Lockstep && sender.sent() > 0 {
-            let words = commits.actor_snapshot(index as usize);
-            let n_step = row.n_step_words(settings.n_step, settings.envs);
-            let snapshot = ActorSnapshot::read(
-                &words,
-                &settings.chunk,
-                settings.envs,
-                exploration.state().len(),
-                n_step,
-            );
-            // To begin new episodes instead would change the run's bits.
-            if snapshot.is_none() && settings.chunk.actor_snapshot_words > 0 {
-                return Err(Exit::Failed(ActorError::Snapshot));
+        let snapshot_layout = settings.config.actor_snapshot_layout();
+        let snapshot = match snapshot_layout.filter(|_| sender.sent() > 0) {
+            None => None,
+            Some(layout) => {
+                let words = commits.actor_snapshot(index as usize);
+                // To begin new episodes instead would change the run's bits.
+                let snapshot = ActorSnapshot::read(&words, &layout).ok_or(Exit::Failed(ActorError::Snapshot))?;
+                Some(snapshot)
             }
-            snapshot
-        } else {
-            None
         };
         Ok(Self {
             settings,

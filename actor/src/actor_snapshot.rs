@@ -1,7 +1,7 @@
 //! An actor's state between two chunks: all that another process needs to take its place and continue with the same
 //! bits.
 
-use shoal_common::transition::ChunkLayout;
+use shoal_common::actor_snapshot::ActorSnapshotLayout;
 
 /// The state of an actor and of its environment server.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,24 +40,15 @@ impl ActorSnapshot {
             .collect()
     }
 
-    /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of
-    /// transitions of several steps; `None` if `layout` has another number of words.
-    pub(crate) fn read(
-        words: &[u64],
-        layout: &ChunkLayout,
-        envs: usize,
-        exploration: usize,
-        n_step: usize,
-    ) -> Option<Self> {
-        let own = 1 + exploration + 2 * envs + n_step;
-        let environments = layout.actor_snapshot_words.checked_sub(own)?;
-        let (environments, rest) = words.split_at_checked(environments)?;
+    /// Reads a snapshot of this layout; `None` if there are more or fewer words.
+    pub(crate) fn read(words: &[u64], layout: &ActorSnapshotLayout) -> Option<Self> {
+        let (environments, rest) = words.split_at_checked(layout.environments)?;
         let (step, rest) = rest.split_first()?;
-        let (exploration, rest) = rest.split_at_checked(exploration)?;
-        let (returns, rest) = rest.split_at_checked(envs)?;
-        let (lengths, rest) = rest.split_at_checked(envs)?;
+        let (exploration, rest) = rest.split_at_checked(layout.exploration)?;
+        let (returns, rest) = rest.split_at_checked(layout.envs)?;
+        let (lengths, rest) = rest.split_at_checked(layout.envs)?;
         let numbers = |words: &[u64]| words.iter().map(|bits| f64::from_bits(*bits)).collect();
-        (rest.len() == n_step).then(|| Self {
+        (rest.len() == layout.n_step).then(|| Self {
             environments: environments.into(),
             step: *step,
             exploration: numbers(exploration),
@@ -71,16 +62,15 @@ impl ActorSnapshot {
 
 #[cfg(test)]
 mod tests {
-    use shoal_common::transition::RowLayout;
-
     use super::*;
 
     #[test]
     fn a_snapshot_reads_back_and_other_words_are_refused() {
-        let layout = ChunkLayout {
-            row: RowLayout::new(3, 2),
-            rows: 4,
-            actor_snapshot_words: 10 + 1 + 2 * (2 + 2) + 3,
+        let layout = ActorSnapshotLayout {
+            environments: 10,
+            exploration: 4,
+            envs: 2,
+            n_step: 3,
         };
         let snapshot = ActorSnapshot {
             environments: (0..10).collect(),
@@ -91,13 +81,10 @@ mod tests {
             n_step: vec![7, 8, 9],
         };
         let words = snapshot.words();
-        assert_eq!(ActorSnapshot::read(&words, &layout, 2, 4, 3), Some(snapshot));
-        assert_eq!(ActorSnapshot::read(&words[1..], &layout, 2, 4, 3), None);
-        assert_eq!(ActorSnapshot::read(&[], &layout, 2, 4, 3), None);
-        let free = ChunkLayout {
-            actor_snapshot_words: 0,
-            ..layout
-        };
-        assert_eq!(ActorSnapshot::read(&words, &free, 2, 4, 3), None);
+        assert_eq!(words.len(), layout.words());
+        assert_eq!(ActorSnapshot::read(&words, &layout), Some(snapshot));
+        assert_eq!(ActorSnapshot::read(&words[1..], &layout), None);
+        assert_eq!(ActorSnapshot::read(&[&words[..], &[0]].concat(), &layout), None);
+        assert_eq!(ActorSnapshot::read(&[], &layout), None);
     }
 }

@@ -30,9 +30,9 @@ pub struct EvaluatorSettings {
     /// The run's configuration.
     pub config: Config,
     /// The environment server's index.
-    pub server: u32,
+    server: u32,
     /// The number of environments that it steps at once.
-    pub envs: usize,
+    envs: usize,
     /// The run directory, where the best policy is written, and all evaluated ones if configured.
     pub run: RunDir,
     /// The period of the policy that a previous evaluator evaluated last.

@@ -82,7 +82,7 @@ impl Exploration {
             }
             Self::Softmax(logits, stream) => {
                 let stream = seek(stream, step);
-                for (action, logits) in actions.iter_mut().zip(logits.of(parameters, observations)) {
+                for (action, logits) in actions.iter_mut().zip(logits.compute(parameters, observations)) {
                     *action = draw(logits, stream.random()) as f32;
                 }
             }
@@ -90,7 +90,7 @@ impl Exploration {
                 let stream = seek(stream, step);
                 let epsilon = epsilon.after(env_steps);
                 let count = values.actions();
-                for (action, values) in actions.iter_mut().zip(values.of(parameters, observations)) {
+                for (action, values) in actions.iter_mut().zip(values.compute(parameters, observations)) {
                     // Both are always drawn, so that one environment's choice does not shift the next one's random
                     // numbers.
                     let (explore, which): (f64, f64) = (stream.random(), stream.random());

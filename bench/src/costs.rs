@@ -216,7 +216,7 @@ fn chunks(
     let learner = Notifier::new(domain, EventName(Role::Learner, 0))?;
     let mut intake = Intake::open(domain, 1, window, config.chunk_layout(), u64::MAX)?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
-    intake.drain(replay, window, |_| false)?;
+    intake.take_in_turn(replay, window, |_| false)?;
     let commits = CommitReader::open(&temporary.run.replay_file())?;
     let mut sender = handshake
         .wait(&commits, &listener, &budget.stop, || {})
@@ -237,7 +237,7 @@ fn chunks(
         }
         let between = Instant::now();
         let head = replay.head();
-        intake.drain(replay, window, |_| false)?;
+        intake.take_in_turn(replay, window, |_| false)?;
         // The learner also counts the episodes that ended.
         std::hint::black_box((head..replay.head()).filter(|i| row.read(replay.row(*i)).last).count());
         let after = Instant::now();

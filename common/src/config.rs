@@ -35,6 +35,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
 
+use crate::actor_snapshot::ActorSnapshotLayout;
 pub use crate::algorithms::*;
 
 /// The complete configuration of a run.
@@ -228,21 +229,26 @@ impl Config {
         }
     }
 
-    /// Words of an actor's snapshot between two chunks; 0 if there are no snapshots. Snapshots exist in lockstep runs
-    /// whose environments can save their state: the replacement of a killed process then continues with the same bits.
-    pub fn actor_snapshot_words(&self) -> usize {
+    /// The layout of an actor's snapshot between two chunks; `None` if there are no snapshots. They exist in lockstep
+    /// runs whose environments can save their state: the replacement of a killed process then continues with the same
+    /// bits.
+    pub fn actor_snapshot_layout(&self) -> Option<ActorSnapshotLayout> {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
-            (Mode::Free, _) | (_, 0) => 0,
-            // The actor's step; for each environment the state of its exploration and its episode's return and length;
-            // and what is not in a chunk yet.
-            (Mode::Lockstep, snapshot) => {
+            (Mode::Free, _) | (_, 0) => None,
+            (Mode::Lockstep, environments) => Some(ActorSnapshotLayout {
+                environments,
                 // An algorithm that cannot control the environment is refused before there is a snapshot.
-                let exploration = self.behaviour(0).map_or(0, |behaviour| behaviour.state_width());
-                let n_step = self.row_layout().n_step_words(self.replay.n_step as usize, envs);
-                snapshot + 1 + envs * (exploration + 2) + n_step
-            }
+                exploration: envs * self.behaviour(0).map_or(0, |behaviour| behaviour.state_width()),
+                envs,
+                n_step: self.row_layout().n_step_words(self.replay.n_step as usize, envs),
+            }),
         }
+    }
+
+    /// Words of an actor's snapshot; 0 if there are no snapshots.
+    pub fn actor_snapshot_words(&self) -> usize {
+        self.actor_snapshot_layout().map_or(0, |layout| layout.words())
     }
 
     /// Checks every value, by itself and together with the others.

@@ -9,6 +9,7 @@
 //! | `shoal-policy` | networks, and policies as actors and evaluator use them (imports `shoal-base` alone) |
 //! | `shoal-common` | the algorithms' settings, the configuration, the run directory |
 
+pub mod actor_snapshot;
 pub mod algorithms;
 pub mod config;
 pub mod evaluator_state;

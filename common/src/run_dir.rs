@@ -121,6 +121,9 @@ fn id_of(directory: &std::fs::Metadata) -> RunDirId {
 /// How long `config.toml` may be missing: some editors rename the old file before they write the new one.
 const EDITOR_RENAME_TIMEOUT: Duration = Duration::from_millis(300);
 
+/// How long a launcher may take to end after the process that started it was killed: the system first ends its writes.
+const ORPHAN_END_TIMEOUT: Duration = Duration::from_secs(10);
+
 /// A run that this process has locked. The launcher keeps it locked while the run is running; the system releases the
 /// lock when the launcher dies.
 #[derive(Debug)]
@@ -260,8 +263,7 @@ impl RunDir {
             cause,
         };
         let file = File::open(&self.path).map_err(io)?;
-        // A process that only checks whether the run is running holds the lock for a moment.
-        if !file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
+        if !file_lock::lock(&file, file_lock::RELEASE_TIMEOUT).map_err(io)? {
             return Err(RunDirError::Busy(self.path.clone()));
         }
         let locked = LockedRun {
@@ -288,6 +290,21 @@ impl RunDir {
         };
         let file = File::open(&self.path).map_err(io)?;
         file_lock::is_locked(&file).map_err(io)
+    }
+
+    /// As [`is_running`](Self::is_running), but a launcher whose parent was just killed is given a moment to end.
+    ///
+    /// # Errors
+    /// As [`is_running`](Self::is_running).
+    pub fn keeps_running(&self) -> Result<bool, RunDirError> {
+        let since = Instant::now();
+        while self.is_running()? {
+            if since.elapsed() >= ORPHAN_END_TIMEOUT {
+                return Ok(true);
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        Ok(false)
     }
 
     /// What distinguishes the directory from its copies.
@@ -469,6 +486,11 @@ impl RunDir {
     /// `incarnations`: the number of processes started for the run so far, written before each start.
     pub fn incarnations(&self) -> PathBuf {
         self.path.join("incarnations")
+    }
+
+    /// `actors.json`: which actors the learner's host has, if they are not the first ones.
+    pub fn local_actors(&self) -> PathBuf {
+        self.path.join("actors.json")
     }
 
     /// `origin.json`: the run or the dataset that this one began with.

@@ -84,9 +84,6 @@ fn build<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>
 }
 
 #[cfg(test)]
-mod names_elsewhere;
-
-#[cfg(test)]
 mod tests {
     use super::*;
     use crate::description::Description;

@@ -110,7 +110,7 @@ fn serve_until_stopped(
         stream,
         ..
     } = arguments;
-    let environments = VectorEnvironment::of(make, *count, (*seed, (*index).into(), *stream))?;
+    let environments = VectorEnvironment::from_factory(make, *count, (*seed, (*index).into(), *stream))?;
     let mut environments = environments.drawn_into(FrameFile::wanted());
     // Before the first answer: the client reads it then.
     if let Some(file) = Description::wanted()

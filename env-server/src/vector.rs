@@ -82,14 +82,14 @@ impl VectorEnvironment {
         server: u64,
         stream: u64,
     ) -> Result<Self, EnvironmentError> {
-        Self::of(|| make(name, parameters), count, (seed, server, stream))
+        Self::from_factory(|| make(name, parameters), count, (seed, server, stream))
     }
 
     /// As [`new`](Self::new), for environments that `make` makes.
     ///
     /// # Errors
     /// When `make` fails.
-    pub fn of<E>(
+    pub fn from_factory<E>(
         make: impl Fn() -> Result<Box<dyn Environment>, E>,
         count: u32,
         (seed, server, number): (u64, u64, u64),

@@ -19,7 +19,10 @@
 //! let transition = Transition { s: &s, a: &a, r: -1.0, discount: 0.99, s_next: &s_next, last: false };
 //! let mut chunk = vec![0.0; row.width()]; // of one row
 //! row.write(&transition, &mut chunk);
-//! let id = ChunkId { incarnation: 0, sequence: 1 };
+//! // A new process of an actor begins with an empty chunk, which tells its incarnation.
+//! let first = ChunkId { incarnation: 1, sequence: 0 };
+//! assert_eq!(replay.append_and_commit(0, first, &[])?, Appended::Accepted);
+//! let id = ChunkId { sequence: 1, ..first };
 //! assert_eq!(replay.append_and_commit(0, id, &chunk)?, Appended::Accepted);
 //! // After a crash a chunk may arrive again.
 //! assert_eq!(replay.append_and_commit(0, id, &chunk)?, Appended::Duplicate);

@@ -14,6 +14,7 @@ import numpy as np
 
 from . import program, tables
 from .errors import ShoalError
+from .locks import is_locked
 from .policy import Policy
 from .transitions import Transitions
 
@@ -154,7 +155,7 @@ class Run:
         Raises ``TimeoutError`` if it is still running, and :class:`ShoalError` if it failed.
         """
         give_up = None if timeout is None else time.monotonic() + timeout
-        while self.status()["running"]:
+        while is_locked(self.path):
             if give_up is not None and time.monotonic() > give_up:
                 raise TimeoutError(f"{self.path} is still running after {timeout} s")
             time.sleep(0.5)

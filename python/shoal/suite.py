@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
@@ -14,6 +13,7 @@ import numpy as np
 
 from . import program, tables
 from .errors import ShoalError
+from .locks import is_locked
 from .run import Run
 
 
@@ -106,15 +106,3 @@ def _result(run: Path) -> dict[str, Any]:
     result = Run(run).result if (run / "config.toml").is_file() else None
     policies = result["policies"] if result else []
     return next((policy for policy in policies if policy["policy"] == result["kept"]), {})
-
-
-def is_locked(directory: Path) -> bool:
-    """Whether a process holds the lock of this run or suite, as the launcher of a running run does."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False

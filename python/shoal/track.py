@@ -20,8 +20,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from .errors import ShoalError
+from .locks import is_locked
 from .run import Run
-from .suite import Suite, is_locked
+from .suite import Suite
 
 #: The files that are followed, and what their metrics are called.
 FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}

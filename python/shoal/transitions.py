@@ -22,7 +22,7 @@ class Batch:
     Attributes:
         row: the number of each transition, counted over the life of the run.
         observation: s, in the environment's units.
-        action: a, as executed; an index for discrete actions.
+        action: a, as chosen; an index for discrete actions. Of an integer box, the environment got the nearest integers.
         reward: r; of several steps (``replay.n_step``), their discounted sum.
         discount: of the value of s': γ, γᵏ for k steps, or 0 where s' is terminal.
         next_observation: s'.

@@ -60,7 +60,7 @@ class Unreachable(Exception):
     """A port in the run's shared memory is unavailable."""
 
 
-def claim(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
+def make_port(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
     """Makes a port. A refusal that may pass is tried again for a while, with ``look_out`` before each new try; any other one
     is final.
 
@@ -92,7 +92,7 @@ class Port:
             .signal_handling_mode(iox2.SignalHandlingMode.Disabled)
             .create(iox2.ServiceType.Ipc)
         )
-        self._server = claim(
+        self._server = make_port(
             lambda: self._service(protocol.requests(run, index))
             .request_response(iox2.Slice[ctypes.c_float], iox2.Slice[ctypes.c_float])
             .request_header(RequestHeader)
@@ -104,7 +104,7 @@ class Port:
             .create(),
             self._look_out,
         )
-        self._listener = claim(
+        self._listener = make_port(
             lambda: self._service(protocol.event(run, f"env-server/{index}"))
             .event()
             .open()
@@ -112,7 +112,7 @@ class Port:
             .create(),
             self._look_out,
         )
-        self._notifier = claim(
+        self._notifier = make_port(
             lambda: self._service(protocol.event(run, client)).event().open().notifier_builder().create(),
             self._look_out,
         )
@@ -135,7 +135,12 @@ class Port:
                     return request
             self._look_out()
             self.beat(Activity.WAITING_FOR_PEER)
-            self._listener.timed_wait(iox2.Duration.from_secs_f64(SLEEP))
+            try:
+                self._listener.timed_wait(iox2.Duration.from_secs_f64(SLEEP))
+            except iox2.ListenerWaitError as error:
+                # So ends the wait of a process that was stopped and is continued.
+                if str(error) != "InterruptSignal":
+                    raise
 
     def notify(self) -> None:
         """Wakes the client. A client that is not there looks for itself when it comes."""
@@ -145,15 +150,17 @@ class Port:
             pass
 
     def begin_work(self) -> None:
-        """Says that the environments are about to do something that this process may not survive; at once, where they have
-        not made a step yet. So the launcher distinguishes a process that dies in its first step from a process that was waiting."""
+        """Reports that the environments are about to do something that this process may not survive: at once if they have not
+        made a step yet, so that the launcher can tell a process that dies in its first step from one that was waiting.
+        """
         if self._heartbeat.steps == 0:
             self._beaten = -BEAT
             self.beat(Activity.WORKING)
 
     def count(self, steps: int) -> None:
-        """Counts so many environment steps more. The first are told at once, and those that prove it able to work: a fast
-        one may fail before its next heartbeat."""
+        """Counts further environment steps. The first ones, and those that prove it able to work, are reported at once: a
+        fast process may fail before its next heartbeat.
+        """
         if steps == 0:
             return
         if self._heartbeat.steps == 0 or self._heartbeat.steps < PROVEN <= self._heartbeat.steps + steps:

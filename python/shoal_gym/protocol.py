@@ -76,7 +76,7 @@ class Heartbeat(ctypes.Structure):
         ("role", ctypes.c_uint32),
         ("index", ctypes.c_uint32),
         ("activity", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("faults", ctypes.c_uint32),
         ("incarnation", ctypes.c_uint64),
         ("steps", ctypes.c_uint64),
         ("policy_version", ctypes.c_uint64),

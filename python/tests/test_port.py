@@ -15,7 +15,7 @@ from shoal_gym import port
 from shoal_gym.protocol import Heartbeat, RequestHeader, ResponseHeader
 
 
-class Claim(unittest.TestCase):
+class MakePort(unittest.TestCase):
     def setUp(self) -> None:
         iox2.set_log_level(iox2.LogLevel.Fatal)
         self._root = tempfile.TemporaryDirectory()
@@ -50,7 +50,7 @@ class Claim(unittest.TestCase):
     def _refused_at_once(self, attempt: Any, name: str) -> None:
         begun = time.monotonic()
         with self.assertRaisesRegex(port.Unreachable, name):
-            port.claim(attempt, self._pause)
+            port.make_port(attempt, self._pause)
         self.assertEqual(self._pauses, 0)
         self.assertLess(time.monotonic() - begun, port.TIMEOUT / 2)
 
@@ -64,10 +64,10 @@ class Claim(unittest.TestCase):
                 holders.clear()
                 gc.collect()
 
-        claimed = port.claim(lambda: self._builder().open().server_builder().create(), pause)
-        self.assertIsNotNone(claimed)
+        made = port.make_port(lambda: self._builder().open().server_builder().create(), pause)
+        self.assertIsNotNone(made)
         self.assertEqual(self._pauses, 3)
-        del claimed
+        del made
 
     def test_a_service_that_is_not_there_is_final(self) -> None:
         self._refused_at_once(lambda: self._builder().open(), "DoesNotExist")
@@ -82,7 +82,7 @@ class Claim(unittest.TestCase):
             raise ValueError("a mistake in the program")
 
         with self.assertRaises(ValueError):
-            port.claim(fail, self._pause)
+            port.make_port(fail, self._pause)
         self.assertEqual(self._pauses, 0)
 
 

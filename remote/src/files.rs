@@ -1,4 +1,4 @@
-//! The files with which commands tell gate and relay what to do. Each has a number for its form.
+//! The files with which commands tell gate and relay what to do. Each has a number for its format.
 
 use std::fmt;
 use std::fs::Permissions;

@@ -14,9 +14,10 @@ use shoal_common::channel::control::{ControlRequest, ControlResponse, HostLease,
 use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::ChunkForwarder;
-use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier};
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier, PORT_TIMEOUT};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Config, Mode};
+use shoal_common::numbers::are_finite;
 use shoal_common::policy::PolicyError;
 use shoal_common::report::{EpisodeReport, Heartbeat};
 use shoal_common::role::{Activity, Role, RoleInstance};
@@ -34,6 +35,7 @@ use crate::files::KeyFile;
 use crate::forwarding::{ChunkOrder, Forwarding};
 use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_INTERVAL, failed};
 use crate::refused;
+use crate::relay::RELAY_HAND_OVER_TIMEOUT;
 use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
@@ -51,12 +53,14 @@ const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 /// How often the launcher gets the status of the hosts.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How long the channels of a released host's actors last while the learner has not committed what they hold. It is
-/// shorter than the learner's host waits for them (`CLAIM_TIMEOUT`), if it has these actors now.
+/// After a host is released, its actors' channels stay open for at most this long, until the learner has committed what
+/// they hold. A new actor of the learner's host waits longer for its channel.
 const RELEASED_TIMEOUT: Duration = Duration::from_secs(4);
+const _: () = assert!(RELEASED_TIMEOUT.as_millis() < PORT_TIMEOUT.as_millis());
 
 /// How long the hosts may take to hand over what they have when the run is over.
-const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
+const HOSTS_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
+const _: () = assert!(RELAY_HAND_OVER_TIMEOUT.as_millis() < HOSTS_HAND_OVER_TIMEOUT.as_millis());
 
 /// The least time between two warnings about wrong chunks of a host, or about refused connections.
 const WARNING_INTERVAL: Duration = Duration::from_secs(10);
@@ -277,7 +281,7 @@ impl<'a> Gate<'a> {
         // launcher does not know yet need a moment to connect.
         let knows_all = self.epoch.is_some() && (was_announced || since >= self.started_at + RECONNECT_TIMEOUT);
         let has_told_all = knows_all && self.hosts.values().all(gone);
-        has_told_all || since.elapsed() >= HAND_OVER_TIMEOUT
+        has_told_all || since.elapsed() >= HOSTS_HAND_OVER_TIMEOUT
     }
 
     /// Handles what a host has sent. Returns the rows that were forwarded to the learner.
@@ -321,8 +325,7 @@ impl<'a> Gate<'a> {
             return Ok(0);
         };
         let parts = forwarder.parts(&chunk.header, &chunk.numbers);
-        let finite = |rows: &[f32]| rows.iter().all(|number| number.is_finite());
-        if !(ours && parts.is_some_and(|(rows, _)| finite(rows))) {
+        if !(ours && parts.is_some_and(|(rows, _)| are_finite(rows))) {
             // The host repeats it again and again.
             if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
                 host.warned_at = Some(Instant::now());
@@ -489,6 +492,10 @@ impl<'a> Gate<'a> {
                 (Ok(ControlResponse::RunIsEnding), PendingRequest::Join(query, _)) => {
                     answer_join(&query, &Admission::RunIsEnding)?;
                 }
+                // A host that gets no answer asks again.
+                (Ok(ControlResponse::NotNow(why)) | Err(why), PendingRequest::Join(_, hello)) => {
+                    self.warn(format_args!("host {} is not admitted for now: {why}", hello.name));
+                }
                 (answer, PendingRequest::Join(query, hello)) => {
                     let why = match answer {
                         Ok(ControlResponse::Refused(why)) | Err(why) => why,
@@ -511,7 +518,7 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// Takes in a host, or what it has been given again. `asks` is whether the host has just asked for it.
+    /// Admits a host, or updates its lease. `asks` is whether the host has just asked for it.
     fn admit(&mut self, lease: HostLease, asks: bool) -> Result<(), GateError> {
         if let Some(host) = self.hosts.get_mut(&lease.host) {
             // Another number of actors is only announced: the host joins again for it.
@@ -588,8 +595,8 @@ impl<'a> Gate<'a> {
     }
 
     /// Forgets the actors of released hosts when what was forwarded is committed: a new learner would need the history
-    /// of their channels. Those that the learner's host may have now are forgotten after a while anyway. In lockstep
-    /// they are forgotten at once: an unfinished round is collected again.
+    /// of their channels. An actor that the learner's host may take over is forgotten after [`RELEASED_TIMEOUT`] in any
+    /// case. In lockstep actors are forgotten at once: an unfinished round is collected again.
     fn forget_released(&mut self) {
         let config = &self.settings.config;
         self.actors.retain(|index, actor| {

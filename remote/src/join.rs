@@ -31,7 +31,7 @@ pub enum JoinError {
     Wire(#[from] WireError),
     /// There was no answer.
     #[error(
-        "nobody answers at {endpoint}: is the run running there, with --listen{}?",
+        "nobody answers at {endpoint}: is the run running there, with --listen{}? If so, its log may tell why",
         also(endpoint)
     )]
     Silence {

@@ -52,8 +52,8 @@ const MAX_KEPT_EPISODES: usize = 4_000;
 const POLICY_QUERY_TIMEOUT: Duration = Duration::from_secs(10);
 const POLICY_PAUSE: Duration = Duration::from_millis(50);
 
-/// How long the gate may take to get the last chunks. It waits a little longer for its hosts.
-const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(3);
+/// How long the gate may take to get the last chunks.
+pub(crate) const RELAY_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// How long to wait before asking again to be admitted.
 pub(crate) const REJOIN_INTERVAL: Duration = Duration::from_secs(1);
@@ -217,7 +217,8 @@ impl<'a> Relay<'a> {
         }
         let session = network::connect(&host.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
-        let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(refused("create an event"))?;
+        let event =
+            eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(system_error("create an event"))?;
         let wake = Wake {
             arrivals: sender,
             event: Arc::new(event),
@@ -241,7 +242,7 @@ impl<'a> Relay<'a> {
         Ok(Self {
             chunk_queue: start_sending(&session, host)?,
             requests: LauncherRequests::start(&config.run.id, config.actors.max_on_a_host(), run.directory_id()?)
-                .map_err(refused("start a thread"))?,
+                .map_err(system_error("start a thread"))?,
             heartbeat_reports: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
             settings,
@@ -305,7 +306,7 @@ impl<'a> Relay<'a> {
         }
         let since = *self.stop_seen_at.get_or_insert_with(Instant::now);
         let handed_over = self.actors.values().all(|actor| actor.uncommitted.all_forwarded());
-        handed_over || self.lost_actors_at.is_some() || self.is_cut_off() || since.elapsed() >= HAND_OVER_TIMEOUT
+        handed_over || self.lost_actors_at.is_some() || self.is_cut_off() || since.elapsed() >= RELAY_HAND_OVER_TIMEOUT
     }
 
     fn is_cut_off(&self) -> bool {
@@ -617,7 +618,7 @@ impl<'a> Relay<'a> {
         ];
         match poll(&mut ready, timeout.as_ref()) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
-            Err(errno) => return Err(refused("wait for chunks")(errno)),
+            Err(errno) => return Err(system_error("wait for chunks")(errno)),
         }
         let mut count = [0; 8];
         // It fails if there was no arrival.
@@ -628,7 +629,7 @@ impl<'a> Relay<'a> {
 }
 
 /// For `map_err`.
-fn refused<E: Into<std::io::Error>>(action: &'static str) -> impl Fn(E) -> RelayError {
+fn system_error<E: Into<std::io::Error>>(action: &'static str) -> impl Fn(E) -> RelayError {
     move |cause| RelayError::System {
         action,
         cause: cause.into(),
@@ -661,7 +662,7 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
                 }
             }
         })
-        .map_err(refused("start a thread"))?;
+        .map_err(system_error("start a thread"))?;
     Ok(sender)
 }
 
@@ -716,6 +717,6 @@ fn start_asking_for_policies(
     std::thread::Builder::new()
         .name("policies".into())
         .spawn(ask)
-        .map_err(refused("start a thread"))?;
+        .map_err(system_error("start a thread"))?;
     Ok(())
 }

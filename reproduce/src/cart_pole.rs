@@ -219,12 +219,12 @@ fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     let Policy::Scored(mut scores) = policies.config.policy(STATES)? else {
         return Ok(false);
     };
-    let mut numbers = stream(policies.config.run.seed, Purpose::Sampling, 0, 0);
+    let mut numbers = stream(policies.config.run.seed, Purpose::Analysis, 0, 0);
     let bounds: [f32; 4] = [2.4, 2.0, 0.2, 2.0];
     let states: Vec<f32> = (0..STATES)
         .flat_map(|_| bounds.map(|bound| numbers.random_range(-bound..bound)))
         .collect();
-    let mut each = scores.of(&policies.last.parameters, &states);
+    let mut each = scores.compute(&policies.last.parameters, &states);
     let first: Option<Vec<f32>> = each.next().map(Into::into);
     Ok(first.is_none_or(|first| each.all(|scores| scores == first)))
 }

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde::Serialize;
@@ -38,7 +37,7 @@ impl Folder {
         // The path must not depend on a working directory.
         let path = std::fs::canonicalize(path).with_context(|| format!("cannot resolve {here}"))?;
         let lock = File::open(&path).with_context(|| format!("cannot open {here}"))?;
-        if !file_lock::lock(&lock, Duration::ZERO).with_context(|| format!("cannot lock {here}"))? {
+        if !file_lock::lock(&lock, file_lock::RELEASE_TIMEOUT).with_context(|| format!("cannot lock {here}"))? {
             bail!("another `shoal reproduce` is using {here}: wait for it, or choose another directory with --out");
         }
         let results = experiments

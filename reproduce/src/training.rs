@@ -26,7 +26,7 @@ impl SeedProgress {
             return Ok(Self::Absent);
         }
         let directory = RunDir::open(run)?;
-        if directory.is_running()? {
+        if directory.keeps_running()? {
             return Err(RunDirError::Busy(run.into()).into());
         }
         let rest = status::saved_status(&directory.config()?, &directory)?;

@@ -17,7 +17,7 @@ use rustix::io::Errno;
 use shoal_common::role::RoleInstance;
 
 pub use self::group::ChildGroup;
-pub use self::output::{ChildOutput, Line, Writer, escape_control_characters};
+pub use self::output::{ChildOutput, Line, OutputSource, escape_control_characters};
 pub use self::process::ChildProcess;
 pub use self::tied::{exec_tied, tie_to_parent, tied};
 

@@ -24,6 +24,9 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(120);
 /// How long the launcher of a stopped run may take to draw its figures.
 const FIGURES_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// Pause before the launcher is asked again in new shared memory.
+const ASK_AGAIN_PAUSE: Duration = Duration::from_millis(50);
+
 /// A run, whose launcher is asked if it has one.
 #[derive(Debug)]
 pub struct RunClient {
@@ -43,15 +46,24 @@ impl RunClient {
 
     /// Asks the run's launcher; `None` if there is none, or it ends before it answers.
     fn ask(&self, request: ControlRequest, timeout: Duration) -> anyhow::Result<Option<ControlResponse>> {
-        if !self.run.is_running()? {
-            return Ok(None);
+        let begun = Instant::now();
+        loop {
+            if !self.run.is_running()? {
+                return Ok(None);
+            }
+            let domain = Domain::visit(&self.config.run.id, self.config.actors.max_on_a_host())?;
+            let remaining = timeout.saturating_sub(begun.elapsed());
+            let answer = self.ask_in(&domain, request.clone(), remaining);
+            let left = domain.leave();
+            let is_removed = |error: &anyhow::Error| matches!(error.downcast_ref(), Some(ControlError::Removed));
+            if answer.as_ref().is_err_and(is_removed) && begun.elapsed() < timeout {
+                std::thread::sleep(ASK_AGAIN_PAUSE);
+                continue;
+            }
+            let answer = answer?;
+            left?;
+            return Ok(answer);
         }
-        let domain = Domain::visit(&self.config.run.id, self.config.actors.max_on_a_host())?;
-        let answer = self.ask_in(&domain, request, timeout);
-        let left = domain.leave();
-        let answer = answer?;
-        left?;
-        Ok(answer)
     }
 
     fn ask_in(
@@ -104,7 +116,7 @@ impl RunClient {
     fn reason_for_no_roles(&self) -> anyhow::Result<Option<OutcomeReason>> {
         let outcome = RunOutcome::read(&self.run)?;
         let reason = outcome.and_then(|outcome| outcome.reason);
-        Ok(reason.filter(|reason| !matches!(reason, OutcomeReason::Other(_))))
+        Ok(reason.filter(|reason| matches!(reason, OutcomeReason::Starting | OutcomeReason::FinalEvaluation)))
     }
 
     /// The status, by the run's files, of a run whose launcher has no roles yet, or none any more. `None` if the

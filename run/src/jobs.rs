@@ -32,8 +32,8 @@ pub enum TrainingEnd {
     Interrupted,
 }
 
-/// Processes the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
-/// this thread passes to `observe`; that is also called once a second without an event.
+/// Processes the queue with at most `parallel` threads until it is empty or a signal has arrived. `work` may send
+/// events, which this thread passes to `observe`; that is also called once a second without an event.
 pub fn run_jobs<Job: Send, Event: Send>(
     queue: VecDeque<Job>,
     parallel: usize,
@@ -41,22 +41,36 @@ pub fn run_jobs<Job: Send, Event: Send>(
     work: impl Fn(Job, &mpsc::Sender<Event>) + Sync,
     mut observe: impl FnMut(Option<Event>),
 ) {
+    let threads = parallel.min(queue.len());
     let queue = Mutex::new(queue);
     let next = || {
         let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
         queue.pop_front().filter(|_| signals.received().is_none())
     };
+    let do_jobs = |events: mpsc::Sender<Event>| {
+        while let Some(job) = next() {
+            work(job, &events);
+        }
+    };
     std::thread::scope(|scope| {
         let (events, receiver) = mpsc::channel();
-        for _ in 0..parallel {
-            let (events, next, work) = (events.clone(), &next, &work);
-            scope.spawn(move || {
-                while let Some(job) = next() {
-                    work(job, &events);
-                }
-            });
+        let mut started = 0;
+        while started < threads {
+            let (events, do_jobs) = (events.clone(), &do_jobs);
+            if std::thread::Builder::new()
+                .spawn_scoped(scope, move || do_jobs(events))
+                .is_err()
+            {
+                break;
+            }
+            started += 1;
         }
-        drop(events);
+        // If the system allows fewer threads, they do all jobs; if it allows none, this thread does.
+        if started == 0 {
+            do_jobs(events);
+        } else {
+            drop(events);
+        }
         loop {
             match receiver.recv_timeout(POLL_INTERVAL) {
                 Ok(event) => observe(Some(event)),
@@ -158,5 +172,11 @@ mod tests {
         run_jobs((0..50).collect(), 3, &signals, work, |event| done.extend(event));
         done.sort_unstable();
         assert_eq!(done, (0..50).map(|job| job * 2).collect::<Vec<_>>());
+
+        // The system cannot make so many threads.
+        done.clear();
+        run_jobs((0..2).collect(), usize::MAX, &signals, work, |event| done.extend(event));
+        done.sort_unstable();
+        assert_eq!(done, [0, 2]);
     }
 }

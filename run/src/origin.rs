@@ -8,7 +8,7 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use shoal_common::algorithms::TransitionUse;
-use shoal_common::config::{Config, explanation};
+use shoal_common::config::{Config, Difference, explanation};
 use shoal_common::run_dir::{LockedRun, RunDir, RunDirError};
 use shoal_common::section::Change;
 use shoal_common::versioned_file::VersionedFile;
@@ -221,8 +221,9 @@ impl Predecessor {
                 algorithms[0], algorithms[1]
             ));
         }
-        let learned = |config: &Config| config.algorithm.settings().learned(&config.spec);
-        if learned(old) == learned(new) {
+        // Two algorithms' configurations may have networks of one shape whose outputs or inputs mean something else.
+        let shapes = |config: &Config| (config.learned(), config.policy_layout().ok());
+        if shapes(old) == shapes(new) {
             return Ok(());
         }
         for (what, [old, new]) in [
@@ -233,7 +234,14 @@ impl Predecessor {
                 return refused(format!("its networks are for other {what}, {old:?} instead of {new:?}"));
             }
         }
-        let shapes = old.differences(new).into_iter().filter(|it| it.change == Change::Shape);
+        let more = old
+            .algorithm
+            .settings()
+            .for_successor()
+            .or(new.algorithm.settings().for_successor());
+        let more = more.map(|(key, _)| format!("{}.{key}", algorithms[0]));
+        let of_shape = |it: &Difference| it.change == Change::Shape || Some(&it.key) == more.as_ref();
+        let shapes = old.differences(new).into_iter().filter(of_shape);
         let differing: Vec<String> = shapes.map(|it| format!("{} = {}", it.key, it.before)).collect();
         refused(format!("its networks have another shape: {}", differing.join(", ")))
     }
@@ -280,17 +288,21 @@ impl Predecessor {
     }
 
     fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<RunOrigin> {
-        let rows = match &self.replay {
-            None => 0,
+        // The rows of the old replay that the new one begins with.
+        let copied = match &self.replay {
+            None => 0..0,
             Some((old, _)) => {
                 let mut new = Replay::create(&run.replay_file(), &replay_layout(config))?;
-                new.inherit_rows(old, self.rows(old, config))?
+                let count = new.inherit_rows(old, self.rows(old, config))?;
+                let end = old.rows().end;
+                end - count..end
             }
         };
+        let rows = copied.end - copied.start;
         let Checkpoint { counters, arrays } = &self.checkpoint;
         let weights = registry::weights(config);
         let fresh = registry::new(config)?;
-        let state = registry::inherited(&*fresh, &weights, SavedState::from(arrays.clone()), rows)?;
+        let state = registry::inherited(&*fresh, &weights, SavedState::from(arrays.clone()), copied)?;
         let borrowed: Vec<(&str, &[f32])> = state
             .iter()
             .map(|(name, numbers)| (*name, numbers.as_slice()))

@@ -9,7 +9,6 @@ use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
@@ -370,7 +369,7 @@ impl Suite {
 pub fn lock(directory: &Path) -> anyhow::Result<File> {
     let here = directory.display();
     let file = File::open(directory).with_context(|| format!("cannot open {here}"))?;
-    if !file_lock::lock(&file, Duration::from_millis(200)).with_context(|| format!("cannot lock {here}"))? {
+    if !file_lock::lock(&file, file_lock::RELEASE_TIMEOUT).with_context(|| format!("cannot lock {here}"))? {
         bail!("another process works on the suite in {here}: wait for it, or end it");
     }
     Ok(file)

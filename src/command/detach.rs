@@ -57,19 +57,23 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
     start_detached(path, (arguments, timeout), output, is_at_work, how_to_end)
 }
 
-/// As [`resume_run`] for a suite. Returns when a process trains one of its runs.
+/// As [`resume_run`] for a suite. Returns when a process trains one of its runs, or has worked on it for a while.
 ///
 /// # Errors
-/// When a process works on it already, or none trains in time.
+/// When a process works on it already, or the new one does not begin in time.
 pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
     drop(suite::lock(path)?);
+    let begun = Instant::now();
     let is_at_work = || {
         let trials = Suite::read(path)?.map(|suite| suite.runs(path)).unwrap_or_default();
         let mut runs = trials.iter().filter_map(|run| RunDir::open(run).ok());
-        Ok(file_lock::is_locked(&File::open(path)?)? && runs.any(|run| run.is_running().unwrap_or(false)))
+        // Before the first run begins, its environment is started twice, which may take minutes.
+        let has_begun = runs.any(|run| run.is_running().unwrap_or(false)) || begun.elapsed() >= TIMEOUT;
+        Ok(has_begun && file_lock::is_locked(&File::open(path)?)?)
     };
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
-    start_detached(path, (arguments, TIMEOUT), output, is_at_work, how_to_end)
+    let timeout = TIMEOUT + 2 * REFUSED_END_TIMEOUT;
+    start_detached(path, (arguments, timeout), output, is_at_work, how_to_end)
 }
 
 fn start_detached(

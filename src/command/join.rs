@@ -114,7 +114,7 @@ mod with_network {
     use shoal_run::usage::UsageError;
 
     use super::*;
-    use crate::launcher::joined::{self, JoinEnd, JoinEvents};
+    use crate::launcher::joined_launcher::{self, JoinEnd, JoinEvents};
 
     /// The exit code if the run could not be reached, or did not admit the host again, for too long.
     const GAVE_UP: u8 = 4;
@@ -126,6 +126,8 @@ mod with_network {
     enum HostEnd {
         Exit(ExitCode),
         JoinAgain(JoinAgain),
+        /// The run listens at another endpoint now.
+        Moved,
     }
 
     /// This host, as the run knows it, and how it reaches the run.
@@ -141,13 +143,17 @@ mod with_network {
     /// another number of them, joins again.
     pub(super) fn join(args: &JoinArgs, run: &str, mut actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
-        let (endpoint, key) = endpoint(args, run)?;
+        let mut reached = endpoint_and_key(args, run)?;
         remove_abandoned(&std::env::temp_dir());
         let signals = Signals::register()?;
         let mut attempt = 1;
         loop {
-            match join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, attempt)? {
+            match join_once(args, run, actors, reached.clone(), &signals, attempt)? {
                 HostEnd::Exit(code) => return Ok(code),
+                HostEnd::Moved => {
+                    reached = endpoint_and_key(args, run)?;
+                    say(format!("the run listens on {} now; joining again", reached.0));
+                }
                 HostEnd::JoinAgain(JoinAgain::LostActors) => {
                     say("the run has given the actors of this host to others; joining again");
                 }
@@ -188,6 +194,7 @@ mod with_network {
         let (lease, connection) = match ask_to_be_admitted(args, run, &hello, reached, &interrupt, attempt)? {
             Answer::Admitted(lease, connection) => (lease, connection),
             Answer::Exit(code) => return Ok(HostEnd::Exit(code)),
+            Answer::Moved => return Ok(HostEnd::Moved),
         };
         let temporary = std::env::temp_dir().join(format!("{TEMPORARY_PREFIX}{number:016x}"));
         let path = match (&args.local, attempt) {
@@ -218,6 +225,8 @@ mod with_network {
     enum Answer {
         Admitted(WireLease, GateConnection),
         Exit(ExitCode),
+        /// The run listens at another endpoint.
+        Moved,
     }
 
     /// Asks the run to admit this host; `attempt` counts from 1.
@@ -233,7 +242,7 @@ mod with_network {
         attempt: u32,
     ) -> anyhow::Result<Answer> {
         let joins_again = attempt > 1;
-        let ends = || interrupt.signal().is_some() || is_finished(run);
+        let ends = || interrupt.signal().is_some() || is_finished(run) || has_moved(run, endpoint);
         // When a host joins again, the run may not have got its former actors back yet.
         let said = Cell::new(false);
         let ask_again = |why: &str| {
@@ -264,6 +273,7 @@ mod with_network {
             }
             (Ok((Admission::Refused(why), _)), None) => bail!("{endpoint} does not admit this host: {why}"),
             (Err(JoinError::Silence { .. }), None) if is_finished(run) => run_is_over(),
+            (Err(JoinError::Silence { .. }), None) if has_moved(run, endpoint) => Ok(Answer::Moved),
             (Err(error @ JoinError::Silence { .. }), None) => give_up(error.to_string()),
             (Err(error), None) => Err(error.into()),
         }
@@ -319,8 +329,9 @@ mod with_network {
         let events = JoinEvents {
             on_relay_ready: Box::new(|| keeper.end()),
             run_is_over: Box::new(|| has_heard() || is_finished(place)),
+            run_has_moved: Box::new(|| has_moved(place, &endpoint)),
         };
-        let ending = joined::run(config, &run, signals, actors, args.give_up, events);
+        let ending = joined_launcher::run(config, &run, signals, actors, args.give_up, events);
         if args.local.is_none() && ending.is_err() {
             // While this process has the lock, so that no other one takes the directory for an abandoned one.
             keep_log(&run);
@@ -331,6 +342,7 @@ mod with_network {
                 ExitCode::SUCCESS
             }
             JoinEnd::JoinAgain(why) => return Ok(HostEnd::JoinAgain(why)),
+            JoinEnd::Moved => return Ok(HostEnd::Moved),
             JoinEnd::Stopped => ExitCode::SUCCESS,
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {
@@ -387,8 +399,14 @@ mod with_network {
         matches!(outcome, Ok(Ok(Some(outcome))) if outcome.state == RunState::Finished)
     }
 
+    /// Whether this is the directory of a run that listens at another endpoint, as after a scheduler has moved it.
+    fn has_moved(run: &str, endpoint: &Endpoint) -> bool {
+        let directory = Path::new(run);
+        directory.is_dir() && JoinFile::read(directory).is_ok_and(|file| file.endpoint != *endpoint)
+    }
+
     /// Where to connect to, and with which key.
-    fn endpoint(args: &JoinArgs, run: &str) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
+    fn endpoint_and_key(args: &JoinArgs, run: &str) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
         let directory = Path::new(run);
         let (endpoint, key) = if directory.is_dir() {
             let file = JoinFile::read(directory)

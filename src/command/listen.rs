@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::Args;
 use shoal_common::config::Config;
 use shoal_common::message::say;
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_remote::NOT_BUILT;
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::JoinFile;
@@ -91,7 +91,7 @@ impl ListenArgs {
     }
 
     /// Writes `join.toml` and says how to join, if other hosts may. Returns whether they may.
-    pub(crate) fn prepare(&self, config: &Config, run: &RunDir) -> anyhow::Result<bool> {
+    pub(crate) fn prepare(&self, config: &Config, run: &LockedRun) -> anyhow::Result<bool> {
         self.check()?;
         let Some(endpoint) = &self.listen else { return Ok(false) };
         let mut endpoint = endpoint.parse::<Endpoint>()?;
@@ -104,14 +104,17 @@ impl ListenArgs {
             endpoint = before.listen;
         }
         let listen = endpoint.with_port(timeout)?;
+        // The wait for the port may have been long: by now another run may be at this one's place.
+        run.check()?;
         let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let endpoint = listen.seen_from_elsewhere(&machine);
-        JoinFile::new(endpoint.clone(), listen).write(run)?;
         let mut line = format!("listening on {endpoint}; on other hosts: shoal join {endpoint}");
         if endpoint.is_encrypted() {
             let key = make_keys(config, run, self.new_keys)?;
             line += &format!(" --key {}", key.display());
         }
+        // After the keys: a host that finds another endpoint here reads the key too.
+        JoinFile::new(endpoint, listen).write(run)?;
         say(format!("{line} --actors N"));
         Ok(true)
     }

@@ -21,8 +21,8 @@ pub(crate) struct ScaleArgs {
     /// New number of actors of a joined host. It ends its processes and joins again. May be given several times.
     #[arg(long, value_name = "NAME=N", value_parser = parse_host, group = "numbers")]
     pub(crate) host: Vec<(String, u32)>,
-    /// New number of actors on all hosts together. It is shared by their processor cores; --actors and --host except
-    /// hosts from that.
+    /// New number of actors on all hosts together. They are shared out by processor cores. A host that --actors or
+    /// --host names keeps its number there.
     #[arg(long, value_name = "N", value_parser = parse_small_count, group = "numbers")]
     pub(crate) total: Option<u32>,
 }

@@ -11,6 +11,7 @@ use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::{HostStatus, RoleState, RunStatus};
+use shoal_common::message::{one_line, say};
 use shoal_run::client::RunClient;
 use shoal_run::numbers::thousands;
 use shoal_run::status::saved_status;
@@ -54,6 +55,8 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let screen = screen();
+    // Why there was no answer, if it was said already.
+    let mut silence = None;
     loop {
         if args.json || !std::io::stdout().is_terminal() {
             show(args, &status, &mut std::io::stdout().lock())?;
@@ -61,9 +64,18 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
             screen.set_message(table(&status));
         }
         std::thread::sleep(INTERVAL);
-        match client.status()? {
-            Some(newer) => status = newer,
-            None => break,
+        match client.status() {
+            Ok(Some(newer)) => (status, silence) = (newer, None),
+            Ok(None) => break,
+            // A launcher that is stopped, or busy, may answer later.
+            Err(error) if client.run.is_running().unwrap_or(false) => {
+                let line = one_line(error);
+                if silence.as_ref() != Some(&line) {
+                    screen.suspend(|| say(&line));
+                    silence = Some(line);
+                }
+            }
+            Err(error) => return Err(error),
         }
     }
     screen.finish_and_clear();

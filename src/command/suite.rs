@@ -86,6 +86,8 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     };
     if let Some(directory) = &overrides.run
         && directory.exists()
+        // An empty directory may be the user's.
+        && !matches!(unfinished_files(directory)?, Some(1..))
     {
         let here = directory.display();
         return match Suite::read(directory)? {
@@ -99,12 +101,40 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     // Before anything is made: is each of them a configuration?
     let name = configuration::check(&suite)?;
     let directory = match &overrides.run {
+        Some(path) if path.exists() => RunDir::at(path),
         Some(path) => RunDir::create(path)?,
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
+    let lock = suite::lock(directory.path())?;
+    // Meanwhile another process may have begun another suite here.
+    if unfinished_files(directory.path())?.is_none() {
+        bail!(
+            "{} exists already; choose another directory with --run",
+            directory.path().display()
+        );
+    }
     suite.write(directory.path())?;
     StartRecord::of_this_process().write(directory.path())?;
+    drop(lock);
     begin(directory.path(), options)
+}
+
+/// The number of files in this directory that a suite has left which was killed before it had written its own file; `None`
+/// if there is anything else.
+fn unfinished_files(directory: &Path) -> anyhow::Result<Option<usize>> {
+    if !directory.is_dir() {
+        return Ok(None);
+    }
+    let cannot_read = || format!("cannot read {}", directory.display());
+    let mut count = 0;
+    for entry in std::fs::read_dir(directory).with_context(cannot_read)? {
+        let name = entry.with_context(cannot_read)?.file_name();
+        if !name.to_string_lossy().starts_with("suite.json.") {
+            return Ok(None);
+        }
+        count += 1;
+    }
+    Ok(Some(count))
 }
 
 /// Trains the suite in this directory, here or in a process that outlives this terminal.

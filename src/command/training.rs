@@ -109,11 +109,11 @@ fn train_and_report(
             Err(error) => {
                 run.check()?;
                 let why = match interrupt.signal() {
-                    Some(signal) => format!("the final evaluation was ended by {}", describe(signal)),
-                    None => format!("the final evaluation failed: {}", one_line(error)),
+                    Some(signal) => OutcomeReason::EvaluationEnded(describe(signal)),
+                    None => OutcomeReason::Other(format!("the final evaluation failed: {}", one_line(error))),
                 };
                 let here = run.path().display();
-                launcher::note(run, &why);
+                launcher::note(run, &why.to_string());
                 say(format!(
                     "{why}; the training is finished; to evaluate it: shoal eval {here}"
                 ));

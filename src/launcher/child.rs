@@ -363,12 +363,7 @@ impl Child {
             _ if self.is_retiring => RoleState::Retiring,
             _ if self.is_asked_to_end => RoleState::Ending,
             (_, None) => RoleState::Starting,
-            (_, Some((_, heartbeat))) => match heartbeat.activity() {
-                Some(Activity::WaitingForPeer | Activity::WaitingForServer) => RoleState::WaitingForPeer,
-                Some(Activity::WaitingForRatio) => RoleState::WaitingForRatio,
-                Some(Activity::Done) => RoleState::Done,
-                Some(Activity::Working) | None => RoleState::Working,
-            },
+            (_, Some((_, heartbeat))) => heartbeat.activity().map_or(RoleState::Working, RoleState::from),
         }
     }
 }

@@ -13,7 +13,7 @@ const REAP_INTERVAL: Duration = Duration::from_millis(100);
 /// How long to wait for a receiver that is being restarted when the roles are requested to end.
 const RECEIVER_RESTART_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A request to end the roles, and how they will have ended then.
+/// A request to end the roles, and the result to return afterwards.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct EndRequest<End> {
     at: Instant,
@@ -27,7 +27,8 @@ impl<End> EndRequest<End> {
         Self { at, end }
     }
 
-    /// Whether the end may begin. A `receiver` of what the actors send that has just died is restarted first.
+    /// Whether the end may begin. If `receiver`, the role to which the actors send, has just died, it is restarted
+    /// first.
     pub(super) fn may_begin(&self, supervisor: &Supervisor, receiver: Role) -> bool {
         supervisor.is_ready(receiver) || self.at.elapsed() >= RECEIVER_RESTART_TIMEOUT
     }

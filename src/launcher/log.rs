@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use anyhow::Context;
 use shoal_common::run_dir::RunDir;
-use shoal_run::child_process::{Line, Writer};
+use shoal_run::child_process::{Line, OutputSource};
 use tracing_subscriber::fmt::format;
 use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 
@@ -75,11 +75,11 @@ impl Log {
     }
 
     /// Writes a line of output of `who`, unless it exceeds a limit.
-    pub(super) fn line(&self, who: &str, line: Line<'_>, writer: Writer) {
+    pub(super) fn line(&self, who: &str, line: Line<'_>, source: OutputSource) {
         let mut inner = self.lock();
         match line {
             Line::Kept(text) => {
-                let is_in_log = writer == Writer::Shoal || inner.takes(text);
+                let is_in_log = source == OutputSource::Shoal || inner.takes(text);
                 if is_in_log {
                     inner.write(who, text);
                 }
@@ -179,8 +179,8 @@ mod tests {
         let (log, text) = log_in(directory.path());
         log.note("launcher", "every role is ready");
         let own = "2026-11-28T04:12:57.123456Z DEBUG sent a chunk rows=8";
-        log.line("actor-0", Line::Kept(own), Writer::Shoal);
-        log.line("actor-0", Line::Kept("error: no"), Writer::Shoal);
+        log.line("actor-0", Line::Kept(own), OutputSource::Shoal);
+        log.line("actor-0", Line::Kept("error: no"), OutputSource::Shoal);
         let (text, year) = (text(), &now()[..5]);
         let lines: Vec<_> = text.lines().collect();
         assert!(lines[0].starts_with(&format!("launcher       {year}")) && lines[0].ends_with("Z every role is ready"));
@@ -199,10 +199,10 @@ mod tests {
         let (log, text) = log_in(directory.path());
         let line = "x".repeat(4000);
         for _ in 0..10_000 {
-            log.line("env-server-0", Line::Kept(&line), Writer::Program);
+            log.line("env-server-0", Line::Kept(&line), OutputSource::Program);
         }
-        log.line("env-server-0", Line::Kept("ValueError: too hot"), Writer::Program);
-        log.line("learner-0", Line::Kept("mine"), Writer::Shoal);
+        log.line("env-server-0", Line::Kept("ValueError: too hot"), OutputSource::Program);
+        log.line("learner-0", Line::Kept("mine"), OutputSource::Shoal);
         assert!((MAX_LOG_BYTES - 5000..MAX_LOG_BYTES + 500_000).contains(&(text().len() as u64)));
         assert!(!text().contains("too hot") && text().contains("mine"));
         assert_eq!(text().matches("this log takes no more").count(), 1);
@@ -211,13 +211,13 @@ mod tests {
             log.write_left_out("env-server-0");
             assert_eq!(text().matches("too hot").count(), 1);
         }
-        log.line("env-server-1", Line::TooMuch("too much at once"), Writer::Program);
+        log.line("env-server-1", Line::TooMuch("too much at once"), OutputSource::Program);
         assert!(!text().contains("too much at once"));
         log.write_left_out("env-server-1");
         assert!(text().contains("too much at once"));
         // A launcher that continues the run has a little left.
         let (log, text) = log_in(directory.path());
-        log.line("env-server-0", Line::Kept("again"), Writer::Program);
+        log.line("env-server-0", Line::Kept("again"), OutputSource::Program);
         assert!(text().contains("again"));
     }
 }

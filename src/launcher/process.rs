@@ -8,7 +8,7 @@ use std::process::{ChildStdin, ExitStatus};
 
 use anyhow::Context;
 use shoal_common::role::RoleInstance;
-use shoal_run::child_process::{ChildGroup, ChildOutput, Writer, role_command};
+use shoal_run::child_process::{ChildGroup, ChildOutput, OutputSource, role_command};
 
 use super::log::Log;
 
@@ -21,14 +21,14 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts this program as a role. `writer` is who writes to its standard error.
-    pub(super) fn start(instance: RoleInstance, run: &Path, log: &Log, writer: Writer) -> anyhow::Result<Self> {
+    /// Starts this program as a role. `source` is who writes to its standard error.
+    pub(super) fn start(instance: RoleInstance, run: &Path, log: &Log, source: OutputSource) -> anyhow::Result<Self> {
         let started = ChildGroup::start(&mut role_command(instance, run));
         let (group, stdin, stderr) =
             started.with_context(|| format!("cannot start {} {}", instance.role.name(), instance.index))?;
         let (who, log) = (name(instance), log.clone());
         let read = stderr
-            .map(|stderr| ChildOutput::read(&who.clone(), stderr, writer, move |line| log.line(&who, line, writer)));
+            .map(|stderr| ChildOutput::read(&who.clone(), stderr, source, move |line| log.line(&who, line, source)));
         let output = read.transpose().context("cannot read the output of a role")?;
         Ok(Self { group, stdin, output })
     }

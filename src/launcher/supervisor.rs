@@ -14,22 +14,24 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
-use shoal_common::channel::control::{ControlPort, RoleStatus};
+use shoal_common::channel::control::{ControlPort, RoleStatus, RunDirId};
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::child_process::{Writer, wait_for_any};
+use shoal_run::child_process::{OutputSource, wait_for_any};
 use shoal_run::records::recorder::{Incident, IncidentKind};
 use shoal_run::signals::Signals;
 use tracing_subscriber::filter::LevelFilter;
 
+use self::actors::RefusedActors;
 use self::cleaning::Cleaning;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
 use super::incarnations::Incarnations;
 use super::joined_hosts::JoinedHosts;
+use super::local_actors;
 use super::log::Log;
 use super::process::{Process, describe_exit, name};
 use super::stall::StallDetector;
@@ -78,8 +80,10 @@ pub(super) struct Supervisor {
     cleaning: Cleaning,
     /// The wanted actors of this host, in order.
     actors: Vec<u32>,
-    /// The number of actors that this host shall have beyond these, as soon as other hosts have given them up.
+    /// How many further actors this host gets as soon as other hosts have released them.
     actors_to_take: usize,
+    /// Since when the system refuses what wanted actors need.
+    refused_actors: Option<RefusedActors>,
     /// The most actors that the run may have on all hosts.
     max_actors: u32,
     /// The most actors that this host may have. Their indices are below this number.
@@ -91,9 +95,11 @@ pub(super) struct Supervisor {
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
+    /// Which directory was at that path.
+    directory: RunDirId,
     /// Whether the output of environment servers is Shoal's own or another program's. With `SHOAL_LOG=debug` all of it
     /// is logged.
-    server_output: Writer,
+    server_output: OutputSource,
     /// How long an environment's own program may take to start.
     server_start_limit: Option<Duration>,
     incarnations: Incarnations,
@@ -134,7 +140,16 @@ impl Supervisor {
                 ];
                 children.extend(gate.then(|| Child::new(Role::Gate, 0)));
                 lockstep_actors = lockstep.then_some(config.actors.count);
-                (children, (0..config.actors.count).collect())
+                let count = config.actors.count;
+                let actors = match lockstep {
+                    true => (0..count).collect(),
+                    false => {
+                        let actors = local_actors::read(run, count, config.actors.max_on_a_host())?;
+                        local_actors::write(run, &actors)?;
+                        actors
+                    }
+                };
+                (children, actors)
             }
             SupervisedHost::Joined { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
@@ -148,6 +163,7 @@ impl Supervisor {
             cleaning: Cleaning::new(),
             actors,
             actors_to_take: 0,
+            refused_actors: None,
             joined_hosts: JoinedHosts::new(incarnations.last(), Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
             max_actors_here: config.actors.max_on_a_host(),
@@ -155,10 +171,11 @@ impl Supervisor {
             log,
             incidents: Vec::new(),
             run: run.path().into(),
+            directory: run.directory_id()?,
             server_output: match log_level() {
-                LevelFilter::DEBUG | LevelFilter::TRACE => Writer::Shoal,
-                _ if !config.environment.is_external() => Writer::Shoal,
-                _ => Writer::Program,
+                LevelFilter::DEBUG | LevelFilter::TRACE => OutputSource::Shoal,
+                _ if !config.environment.is_external() => OutputSource::Shoal,
+                _ => OutputSource::Program,
             },
             server_start_limit: config
                 .environment
@@ -211,11 +228,11 @@ impl Supervisor {
         let incarnation = self.incarnations.take(1)?;
         let child = &mut self.children[i];
         child.instance.incarnation = incarnation;
-        let writer = match child.instance.role {
+        let source = match child.instance.role {
             Role::EnvServer => self.server_output,
-            _ => Writer::Shoal,
+            _ => OutputSource::Shoal,
         };
-        let process = Process::start(child.instance, &self.run, &self.log, writer)?;
+        let process = Process::start(child.instance, &self.run, &self.log, source)?;
         self.log
             .note(&name(child.instance), &format!("started as process {}", process.pid()));
         child.begin(process);

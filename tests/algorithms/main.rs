@@ -21,6 +21,7 @@ use shoal_learner::algorithms::sac::Sac;
 use shoal_learner::algorithms::td3::Td3;
 use shoal_learner::networks::digest::sha256;
 use shoal_learner::process::checkpoint::Checkpoints;
+use shoal_run::records::recorder::read_learner;
 use support::{Running, Workplace, error_line, final_result, gets_rows, json, parse, until, wait_for_rows};
 
 /// Rare evaluations of few episodes.
@@ -106,6 +107,24 @@ fn free_q_learning_learns_from_each_row_once_also_with_a_small_ring() {
     );
     assert_eq!(result["updates"], 50_000);
     let log = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
+    assert!(!log.contains("were overwritten"), "{log}");
+
+    // Actors with full windows, whose rows are more than the ring has places.
+    let set = ["run.mode=free", "replay.capacity=300", "replay.tolerance=20000"];
+    let set = [
+        set.map(|key| ["--set", key]).concat(),
+        vec!["--actors", "2", "--envs", "256"],
+    ]
+    .concat();
+    let long = ["frozen-lake", "--steps", "100000000", "--episodes", "100000000"];
+    let running = start(&place, "stopped", &[&long[..], &set].concat());
+    running.wait_for_learning();
+    assert!(place.output(&["stop", "stopped"]).status.success());
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    let steps = place.status("stopped")["env_steps"].as_u64().unwrap() + 100;
+    let output = place.output(&["resume", "stopped", "--steps", &steps.to_string(), "--json"]);
+    assert_eq!(json(&output)["updates"], steps);
+    let log = std::fs::read_to_string(place.path().join("stopped/shoal.log")).unwrap();
     assert!(!log.contains("were overwritten"), "{log}");
 }
 
@@ -241,6 +260,13 @@ fn sac_gives_the_bits_of_its_algorithm_in_a_single_process() {
             result["weights_sha256"],
             twin::of_minibatches(&config, algorithm),
             "{threads}"
+        );
+        // It begins at 1, and an update changes it by about 3e-4 of its value.
+        let records = read_learner(&place.path().join("run/learner.csv")).unwrap();
+        let temperatures: Vec<f64> = records.iter().filter_map(|record| record.temperature).collect();
+        assert!(
+            temperatures.last().is_some_and(|last| (0.8..1.0).contains(last)),
+            "{temperatures:?}"
         );
     }
 }

@@ -217,7 +217,7 @@ pub(crate) fn of_minibatches<A: MinibatchAlgorithm>(config: &Config, mut algorit
                 for (column, index) in indices.iter().enumerate() {
                     batch.set(column, &row.read(&rows[*index as usize]));
                 }
-                algorithm.learn(&batch);
+                algorithm.gradient_step(&batch);
             }
         }
         if over {

@@ -215,12 +215,14 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
             std::thread::sleep(Duration::from_millis(1));
             quota += ROWS as u64;
         }
-        let drained = intake.drain(&mut replay, 8, |replay| replay.head() >= quota).unwrap();
+        let took_any = intake
+            .take_in_turn(&mut replay, 8, |replay| replay.head() >= quota)
+            .unwrap();
         if busy && replay.head() >= quota {
             busy = false;
             reply("took");
         }
-        if !drained && !crawls {
+        if !took_any && !crawls {
             listener.wait(POLL).unwrap();
         }
     }

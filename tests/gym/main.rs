@@ -11,6 +11,7 @@ mod support;
 
 use std::path::Path;
 use std::process::{Command, ExitCode, Stdio};
+use std::time::Duration;
 
 use answers::arbitrary_answers_are_survived_or_named_in_one_line;
 use rustix::process::{Pid, Signal, kill_process};
@@ -61,6 +62,7 @@ fn main() -> ExitCode {
         test!(a_failure_in_the_final_evaluation_costs_an_episode_or_a_line, PYTHON),
         test!(a_signal_ends_the_final_evaluation_in_order, PYTHON),
         test!(a_signal_ends_shoal_eval_in_order, PYTHON),
+        test!(a_server_that_was_stopped_continues, PYTHON),
         test!(frames_are_filmed_and_played_in_the_report, PYTHON),
         test!(an_environment_without_frames_says_why, PYTHON),
     ])
@@ -510,6 +512,28 @@ fn processes_of(place: &Workplace, words: &str) -> Vec<i32> {
         command.contains(words) && directory == here
     })
     .collect()
+}
+
+fn a_server_that_was_stopped_continues() {
+    let place = place();
+    // With so many updates, the server waits for requests most of the time.
+    let slow = ["--steps", "100000000", "--set", "replay.updates_per_step=20"];
+    let running = place.start_in("run", "gym:Pendulum-v1", &slow);
+    running.wait_for_learning();
+    let servers = processes_of(&place, "shoal_gym");
+    assert!(servers.len() >= 2, "the actor's and the evaluator's");
+    for _ in 0..20 {
+        for signal in [Signal::STOP, Signal::CONT] {
+            for pid in &servers {
+                kill_process(Pid::from_raw(*pid).unwrap(), signal).unwrap();
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+    running.wait_for_learning();
+    assert_eq!(processes_of(&place, "shoal_gym"), servers);
+    assert!(place.output(&["stop", "run"]).status.success());
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
 }
 
 fn a_child_process_of_an_environment_blocks_nothing() {

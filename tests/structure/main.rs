@@ -7,6 +7,7 @@
 
 mod crates;
 mod cycles;
+mod environment_names;
 mod lists;
 mod scan;
 

@@ -9,6 +9,10 @@ use std::time::{Duration, Instant};
 /// Pause between two attempts to take a lock that another process holds.
 const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
+/// The timeout for a lock that should be free. A process that only looks at a lock holds it for a moment, and one that
+/// was killed until the system has closed its files.
+pub const RELEASE_TIMEOUT: Duration = Duration::from_millis(200);
+
 /// Locks the file exclusively, waiting at most `timeout`. Returns whether it is locked now.
 ///
 /// # Errors

@@ -133,6 +133,8 @@ pub struct LearnerReport {
     pub actor_loss: f64,
     /// Mean Q(s, a), or for REINFORCE the mean return, averaged as `critic_loss`.
     pub q_mean: f64,
-    /// Number of updates in the averages; if it is 0, the three means are 0.
+    /// The temperature α, averaged as `critic_loss`; NaN for algorithms without one.
+    pub temperature: f64,
+    /// Number of updates in the averages; if it is 0, they are 0.
     pub averaged: u64,
 }

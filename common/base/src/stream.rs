@@ -20,6 +20,8 @@ pub enum Purpose {
     Evaluation = 5,
     /// Random numbers within an update: TD3's noise on target actions, SAC's draws.
     Update = 6,
+    /// States at which a policy is examined after the run.
+    Analysis = 7,
 }
 
 /// The stream of `purpose` for the process `index` in its `incarnation`, under the run's `seed`.

@@ -25,7 +25,7 @@ pub struct ChunkLayout {
 pub struct Transition<'a> {
     /// Observation `s` that the action was chosen for.
     pub s: &'a [f32],
-    /// Action `a`, in environment units, as executed.
+    /// Action `a`, in environment units, as chosen. Servers of integer boxes round it.
     pub a: &'a [f32],
     /// Reward `r`.
     pub r: f32,

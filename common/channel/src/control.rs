@@ -5,6 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::port::client::Client;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
@@ -22,7 +23,7 @@ use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::event::{Listener, Notifier};
 use super::memory;
-use super::service::{HeldService, OpenMode, claim, service_name};
+use super::service::{HeldService, OpenMode, make_port, service_name};
 
 mod message;
 
@@ -88,6 +89,9 @@ pub enum ControlError {
     /// The launcher has ended.
     #[error("the launcher has ended")]
     Gone,
+    /// The shared memory in which the launcher was asked has been removed: the run has ended, or got new shared memory.
+    #[error("the run got new shared memory before the launcher could answer; try again")]
+    Removed,
     /// The launcher does not answer.
     #[error("the launcher does not answer; is it stopped?")]
     Silence,
@@ -109,7 +113,7 @@ impl ControlPort {
     /// # Errors
     /// When shared memory is unavailable.
     pub fn open(domain: &Domain, max_actors: u32) -> Result<Self, ChannelError> {
-        let server = claim(|| {
+        let server = make_port(|| {
             service(domain, OpenMode::Open)?
                 .server_builder()
                 .initial_max_slice_len(response_length(max_actors as usize))
@@ -206,17 +210,25 @@ pub fn ask(
         _ => deadline,
     };
     let request = encode(&AddressedRequest { run, request }).map_err(cannot_ask)?;
-    let make_client = || {
-        service(domain, OpenMode::Open)?
+    let make_ports = || -> Result<_, ChannelError> {
+        let client = service(domain, OpenMode::Open)?
             .client_builder()
             .initial_max_slice_len(request.len().max(REQUEST_BYTES))
             .create()
-            .map_err(cannot_ask)
+            .map_err(cannot_ask)?;
+        Ok((client, Notifier::to_launcher(domain)))
     };
     // A launcher that is starting has not created the service yet, and one that is ending has removed it.
-    let client = loop {
-        match make_client() {
-            Ok(client) => break client,
+    let ports = loop {
+        let Some(made) = domain.make_ports(make_ports) else {
+            return Err(if is_alive() {
+                ControlError::Removed
+            } else {
+                ControlError::Gone
+            });
+        };
+        match made {
+            Ok(ports) => break ports,
             Err(_) if !is_alive() => return Err(ControlError::Gone),
             Err(error) if error.kind == ChannelErrorKind::Missing && Instant::now() >= missing_until => {
                 return Err(ControlError::Missing);
@@ -225,20 +237,35 @@ pub fn ask(
             Err(_) => std::thread::sleep(POLL_INTERVAL),
         }
     };
+    let (client, launcher) = &ports;
+    let answer = await_answer(domain, client, launcher.as_ref(), &request, timeout, is_alive);
+    domain.drop_ports(ports);
+    answer
+}
+
+/// Sends a request and waits for its answer.
+fn await_answer(
+    domain: &Domain,
+    client: &ControlClient,
+    launcher: Option<&Notifier>,
+    request: &[u8],
+    timeout: Duration,
+    is_alive: impl Fn() -> bool,
+) -> Result<ControlResponse, ControlError> {
     let ask = |bytes: &[u8]| {
         let mut request = client.loan_slice(bytes.len()).map_err(cannot_ask)?;
         request.payload_mut().copy_from_slice(bytes);
         request.user_header_mut().version = VERSION;
         request.send().map_err(cannot_ask)
     };
-    let launcher = Notifier::to_launcher(domain);
-    let notify = || launcher.iter().for_each(Notifier::notify);
-    let mut pending = ask(&request)?;
+    let notify = || launcher.into_iter().for_each(Notifier::notify);
+    let mut pending = ask(request)?;
     notify();
-    // Making the client writes files, which takes seconds where the disk is busy. That is no silence of the launcher.
+    // Making the client writes files, which takes seconds where the disk is busy. That time does not count as silence of
+    // the launcher.
     let deadline = Instant::now() + timeout;
     let mut checked = Instant::now();
-    let mut gone = false;
+    let (mut gone, mut removed) = (false, false);
     loop {
         let received = pending.receive().map_err(cannot_ask)?;
         if let Some(response) = received {
@@ -247,6 +274,9 @@ pub fn ask(
         if gone {
             return Err(ControlError::Gone);
         }
+        if removed {
+            return Err(ControlError::Removed);
+        }
         if Instant::now() >= deadline {
             return Err(ControlError::Silence);
         }
@@ -254,10 +284,11 @@ pub fn ask(
         if checked.elapsed() >= LIVENESS_INTERVAL {
             checked = Instant::now();
             gone = !is_alive();
+            removed = !domain.is_current();
         }
         // Ask again: the launcher had not opened its end when the request was sent.
         if pending.number_of_server_connections() == 0 {
-            pending = ask(&request)?;
+            pending = ask(request)?;
             notify();
         }
     }
@@ -303,6 +334,8 @@ pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
         ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
     }))
 }
+
+type ControlClient = Client<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
 type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
@@ -365,5 +398,52 @@ mod tests {
         });
         drop((port, services));
         domain.leave().unwrap();
+    }
+
+    #[test]
+    fn a_visitor_that_outlives_a_run_leaves_the_next_one_of_that_name_alone() {
+        let run_id = format!("b{:x}", std::process::id());
+        let begin = || {
+            let domain = Domain::join(&run_id, 1).unwrap();
+            let mut services = Services::new(&domain).unwrap();
+            services.create_common(&domain).unwrap();
+            (domain, services)
+        };
+        let end = |(domain, services): (Domain, Services)| {
+            drop(services);
+            domain.leave().unwrap();
+        };
+        let minute = Duration::from_secs(60);
+        let run = RunDirId { device: 1, inode: 2 };
+        let first = begin();
+        let visitor = Domain::visit(&run_id, 1).unwrap();
+        let second = std::thread::scope(|scope| {
+            let (asked, has_asked) = std::sync::mpsc::channel();
+            let (begun, has_begun) = std::sync::mpsc::channel::<()>();
+            let visitor = &visitor;
+            let asker = scope.spawn(move || {
+                // It is called first when the request has been sent. Nobody answers.
+                let is_alive = || {
+                    let _ = asked.send(());
+                    let _ = has_begun.recv_timeout(minute);
+                    true
+                };
+                ask(visitor, run, ControlRequest::Stop, minute, is_alive)
+            });
+            has_asked.recv_timeout(minute).unwrap();
+            end(first);
+            let second = begin();
+            drop(begun);
+            let answer = asker.join().unwrap();
+            assert!(matches!(answer, Err(ControlError::Removed)), "{answer:?}");
+            second
+        });
+        // A visitor that has not asked yet.
+        let answer = ask(&visitor, run, ControlRequest::Stop, minute, || true);
+        assert!(matches!(answer, Err(ControlError::Removed)), "{answer:?}");
+        assert!(second.0.is_intact(second.1.count()));
+        assert_eq!(second.1.ports(), 0);
+        end(second);
+        visitor.leave().unwrap();
     }
 }

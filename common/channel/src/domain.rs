@@ -21,6 +21,9 @@ use super::presence::{self, Claim, Presence};
 /// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
+/// How long a visitor waits for it before it does without.
+const VISITOR_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
+
 /// The node name of processes that join a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
 
@@ -193,11 +196,43 @@ impl Domain {
             Ok(now) => (now.dev(), now.ino()) == self.root,
             Err(error) => !is_missing(&error),
         };
-        let has_services = match std::fs::read_dir(directory.join("services")) {
-            Ok(listed) => listed.count() >= services,
-            Err(error) => !is_missing(&error),
-        };
+        // Before the first service, its directory does not exist.
+        let has_services = services == 0
+            || match std::fs::read_dir(directory.join("services")) {
+                Ok(listed) => listed.count() >= services,
+                Err(error) => !is_missing(&error),
+            };
         same && has_services && std::fs::metadata(details).map_or_else(|error| !is_missing(&error), |_| true)
+    }
+
+    /// Whether this is still the shared memory that this process has joined. A visitor may stay while the run ends, and
+    /// even begins again: the run does not wait for it.
+    pub(super) fn is_current(&self) -> bool {
+        self.is_intact(0)
+    }
+
+    /// Calls `make`, which makes ports of a visitor, unless the shared memory that it has joined was removed: services
+    /// have the same names when the run has begun again, and there nobody could free these ports after this process's
+    /// death. Returns `None` then, or if the run's lock cannot be had.
+    pub(super) fn make_ports<Ports>(&self, make: impl FnOnce() -> Ports) -> Option<Ports> {
+        // Files are removed only under this lock.
+        let _lock = self.lock_as_visitor()?;
+        self.is_current().then(make)
+    }
+
+    /// Drops the ports of a visitor. With the last port of a service, iceoryx2 removes the service's files by their
+    /// names, which are the same when the run has begun again. So ports of shared memory that was removed are leaked.
+    pub(super) fn drop_ports<Ports>(&self, ports: Ports) {
+        let lock = self.lock_as_visitor();
+        if lock.is_some() && self.is_current() {
+            drop(ports);
+        } else {
+            std::mem::forget(ports);
+        }
+    }
+
+    fn lock_as_visitor(&self) -> Option<File> {
+        lock_within(&self.directory().ok()?, VISITOR_LOCK_TIMEOUT).ok()?
     }
 
     /// Whether a process of the run is alive, even if iceoryx2 does not find it. Visitors are not counted.
@@ -400,6 +435,11 @@ pub(super) fn user_root() -> Result<PathBuf, DomainError> {
     Ok(root)
 }
 
+/// The most processes that use an event service or a channel of reports at the same time.
+pub(super) fn participants(max_actors: usize) -> usize {
+    2 * max_actors + 8
+}
+
 /// The result of an attempt to take a run's lock.
 enum Attempt {
     Locked(File),
@@ -411,7 +451,11 @@ enum Attempt {
 
 /// Takes the lock of the run in this directory; `None` if there is no such run.
 fn lock(directory: &Path) -> Result<Option<File>, DomainError> {
-    let deadline = Instant::now() + LOCK_TIMEOUT;
+    lock_within(directory, LOCK_TIMEOUT)
+}
+
+fn lock_within(directory: &Path, timeout: Duration) -> Result<Option<File>, DomainError> {
+    let deadline = Instant::now() + timeout;
     loop {
         match try_lock(directory)? {
             Attempt::Locked(lock) => return Ok(Some(lock)),

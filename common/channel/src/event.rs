@@ -18,9 +18,9 @@ use shoal_base::exit::Exit;
 use shoal_base::role::Role;
 use shoal_base::stop::Stop;
 
-use super::domain::Domain;
+use super::domain::{Domain, participants};
 use super::error::{Cause, ChannelError};
-use super::service::{HeldService, OpenMode, claim, service_name};
+use super::service::{HeldService, OpenMode, make_port, service_name};
 use super::{descriptor, memory};
 
 /// Polls before a waiting process blocks. A peer on another core usually answers during the polls. On a shared core
@@ -118,7 +118,7 @@ impl Listener {
     }
 
     fn on(domain: &Domain, channel: String) -> Result<Self, ChannelError> {
-        let listener = claim(|| {
+        let listener = make_port(|| {
             service(domain, &channel, OpenMode::Open)?
                 .listener_builder()
                 .create()
@@ -175,7 +175,7 @@ impl Notifier {
     /// When shared memory is unavailable.
     pub fn new(domain: &Domain, name: EventName) -> Result<Self, ChannelError> {
         let channel = name.to_string();
-        claim(|| Self::on(domain, &channel))
+        make_port(|| Self::on(domain, &channel))
     }
 
     /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the request when
@@ -253,10 +253,6 @@ fn create_on(domain: &Domain, channel: &str) -> Result<HeldService, ChannelError
         ports.list_listeners(|port| visit(port.node_id, port.listener_id.value()));
         ports.list_notifiers(|port| visit(port.node_id, port.notifier_id.value()));
     }))
-}
-
-fn participants(max_actors: usize) -> usize {
-    2 * max_actors + 8
 }
 
 fn service(domain: &Domain, channel: &str, mode: OpenMode) -> Result<PortFactory<ipc::Service>, ChannelError> {

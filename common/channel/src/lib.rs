@@ -25,4 +25,5 @@ pub use error::{ChannelError, ChannelErrorKind, PeerError};
 pub use event::{EventName, Listener, Notifier, wait_for};
 pub use heartbeat::HeartbeatSender;
 pub use memory::free_shared_memory;
+pub use service::PORT_TIMEOUT;
 pub use services::Services;

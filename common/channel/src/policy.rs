@@ -43,7 +43,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::memory;
-use super::service::{HeldService, OpenMode, claim, service_name};
+use super::service::{HeldService, OpenMode, make_port, service_name};
 
 const CHANNEL: &str = "policy";
 
@@ -98,7 +98,7 @@ impl PolicyPublisher {
     /// When shared memory is unavailable, or another learner is alive.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
         let samples = samples(domain.max_actors());
-        let publisher = claim(|| {
+        let publisher = make_port(|| {
             service(domain, OpenMode::Open)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
@@ -143,7 +143,7 @@ impl PolicyReader {
     /// # Errors
     /// When shared memory is unavailable.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
-        let subscriber = claim(|| {
+        let subscriber = make_port(|| {
             service(domain, OpenMode::Open)?
                 .subscriber_builder()
                 .create()

@@ -11,10 +11,10 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 
-use super::domain::Domain;
+use super::domain::{Domain, participants};
 use super::error::ChannelError;
 use super::memory;
-use super::service::{HeldService, OpenMode, claim, service_name};
+use super::service::{HeldService, OpenMode, make_port, service_name};
 
 /// Reports that a reader holds at the same time: each is copied and released.
 const BORROWED: usize = 1;
@@ -177,7 +177,7 @@ impl<R: Report> Receiver<R> for Subscriber<ipc::Service, R, ()> {
 }
 
 fn publisher<R: Report>(domain: &Domain) -> Result<Publisher<ipc::Service, R, ()>, ChannelError> {
-    claim(|| {
+    make_port(|| {
         service::<R>(domain, OpenMode::Open)?
             .publisher_builder()
             .max_loaned_samples(LOANED)
@@ -187,7 +187,7 @@ fn publisher<R: Report>(domain: &Domain) -> Result<Publisher<ipc::Service, R, ()
 }
 
 fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, ()>, ChannelError> {
-    claim(|| {
+    make_port(|| {
         service::<R>(domain, OpenMode::Open)?
             .subscriber_builder()
             .create()
@@ -202,10 +202,6 @@ pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
     let sender = memory::segment::<Header, ()>(samples, size_of::<R>())
         + R::READERS as u64 * memory::connection(1, R::BUFFER, BORROWED, samples);
     memory::service(2 * participants(max_actors)) + senders as u64 * sender
-}
-
-fn participants(max_actors: usize) -> usize {
-    2 * max_actors + 8
 }
 
 /// Creates the service of reports of kind `R`.

@@ -41,14 +41,14 @@ pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName
     ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "make the service name", cause))
 }
 
-/// How long to wait for a port that a dead predecessor occupies.
-pub(super) const CLAIM_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long to wait for a port that another process occupies, usually a dead predecessor.
+pub const PORT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is
 /// transient: a dead process may occupy the port until the launcher has cleaned up after it, and its unfinished files
 /// exist until they are removed. Any other failure is returned at once.
-pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
-    let deadline = Instant::now() + CLAIM_TIMEOUT;
+pub(super) fn make_port<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
+    let deadline = Instant::now() + PORT_TIMEOUT;
     loop {
         match attempt() {
             Err(error) if error.is_transient() && Instant::now() < deadline => {
@@ -129,16 +129,16 @@ mod tests {
         let mut predecessor = Some(publisher(&held).unwrap());
         assert_eq!(publisher(&held).unwrap_err().kind, ChannelErrorKind::Occupied);
         let mut attempts = 0;
-        let claimed = claim(|| {
+        let port = make_port(|| {
             attempts += 1;
             if attempts == 3 {
                 predecessor = None;
             }
             publisher(&service(&domain, OpenMode::Open)?)
         });
-        assert!(claimed.is_ok(), "{claimed:?}");
+        assert!(port.is_ok(), "{port:?}");
         assert_eq!(attempts, 3);
-        drop((claimed, held));
+        drop((port, held));
         domain.leave().unwrap();
     }
 
@@ -154,7 +154,7 @@ mod tests {
         let mut options = std::fs::OpenOptions::new();
         options.write(true).create_new(true).mode(0o600).open(&file).unwrap();
         let (mut failures, mut made) = (Vec::new(), None);
-        let claimed = claim(|| {
+        let port = make_port(|| {
             let attempt = service::<u64>(&domain, OpenMode::Open);
             if let Err(error) = &attempt {
                 failures.push(error.kind);
@@ -163,26 +163,26 @@ mod tests {
             }
             attempt
         });
-        assert!(claimed.is_ok(), "{claimed:?}");
+        assert!(port.is_ok(), "{port:?}");
         assert_eq!(failures, [ChannelErrorKind::Unfinished]);
-        drop((claimed, made));
+        drop((port, made));
         domain.leave().unwrap();
     }
 
     #[test]
     fn a_permanent_failure_is_returned_at_once_and_states_what_to_do() {
         let domain = domain("cc");
-        let claimed = |attempt: &dyn Fn() -> Result<(), ChannelError>| {
+        let error_of = |attempt: &dyn Fn() -> Result<(), ChannelError>| {
             let (begun, mut attempts) = (Instant::now(), 0);
-            let error = claim(|| {
+            let error = make_port(|| {
                 attempts += 1;
                 attempt()
             });
             assert_eq!(attempts, 1, "{error:?}");
-            assert!(begun.elapsed() < CLAIM_TIMEOUT);
+            assert!(begun.elapsed() < PORT_TIMEOUT);
             error.unwrap_err()
         };
-        let missing = claimed(&|| service::<u64>(&domain, OpenMode::Open).map(drop));
+        let missing = error_of(&|| service::<u64>(&domain, OpenMode::Open).map(drop));
         assert_eq!(missing.kind, ChannelErrorKind::Missing);
         assert_eq!(
             missing.to_string(),
@@ -190,9 +190,9 @@ mod tests {
              (PublishSubscribeOpenError::DoesNotExist)"
         );
         let held = service::<u64>(&domain, OpenMode::Create).unwrap();
-        let incompatible = claimed(&|| service::<u8>(&domain, OpenMode::Open).map(drop));
+        let incompatible = error_of(&|| service::<u8>(&domain, OpenMode::Open).map(drop));
         assert_eq!(incompatible.kind, ChannelErrorKind::Incompatible);
-        let refused = claimed(&|| Err(ChannelError::new(CHANNEL, "ask", PeerError::Refused)));
+        let refused = error_of(&|| Err(ChannelError::new(CHANNEL, "ask", PeerError::Refused)));
         assert_eq!(
             refused.to_string(),
             "channel test: cannot ask: the environment server refused the request"

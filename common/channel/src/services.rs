@@ -153,6 +153,14 @@ impl Services {
         occupied
     }
 
+    /// Number of ports of all services.
+    #[cfg(test)]
+    pub(super) fn ports(&self) -> usize {
+        let mut ports = 0;
+        self.each_port(|_, _| ports += 1);
+        ports
+    }
+
     /// Visits every port of every service.
     fn each_port(&self, mut visit: impl FnMut(UniqueNodeId, u128)) {
         let mut visit = |node, port| {

@@ -30,7 +30,7 @@ use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::event::{Listener, wait_for};
 use super::memory;
-use super::service::{HeldService, OpenMode, claim, service_name};
+use super::service::{HeldService, OpenMode, make_port, service_name};
 use crate::commit::{ChunkId, CommitReader};
 
 /// Chunks that the learner holds at the same time.
@@ -150,7 +150,7 @@ impl ChunkSender {
         window: u32,
     ) -> Result<Handshake, ChannelError> {
         let channel = name(actor);
-        let (service, publisher) = claim(|| {
+        let (service, publisher) = make_port(|| {
             let service = service(domain, &channel, window, OpenMode::Open)?;
             let publisher = publisher(&service, &channel, &layout)?;
             Ok((service, publisher))
@@ -390,7 +390,7 @@ impl ChunkReceiver {
     }
 
     fn open_channel(domain: &Domain, channel: String, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
-        let subscriber = claim(|| {
+        let subscriber = make_port(|| {
             service(domain, &channel, window, OpenMode::Open)?
                 .subscriber_builder()
                 .buffer_size(buffer(window))

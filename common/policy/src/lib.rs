@@ -140,7 +140,7 @@ impl Policy {
             Self::Deterministic(network) => network.forward(parameters, observations, actions),
             Self::Gaussian(policy) => policy.mean(parameters, observations, actions),
             Self::Scored(scores) => {
-                let all_scores = scores.of(parameters, observations);
+                let all_scores = scores.compute(parameters, observations);
                 for (action, scores) in actions.iter_mut().zip(all_scores) {
                     *action = argmax(scores) as f32;
                 }
@@ -177,7 +177,7 @@ pub fn gaussian(network: NetworkLayout, spec: &EnvironmentSpec, batch: usize) ->
 /// # Errors
 /// When the actions are not discrete, or the observations are not real numbers.
 pub fn softmax(network: NetworkLayout, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
-    counted_actions(spec)?;
+    discrete_actions(spec)?;
     check_real_observations(spec)?;
     Ok(Scores::softmax(network, batch))
 }
@@ -193,7 +193,7 @@ pub fn action_values(
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
-    counted_actions(spec)?;
+    discrete_actions(spec)?;
     check_real_observations(spec)?;
     Ok(if dueling {
         Scores::dueling(network, batch)
@@ -218,14 +218,14 @@ pub fn check_real_observations(spec: &EnvironmentSpec) -> Result<(), PolicyError
 /// # Errors
 /// When observations or actions are not discrete.
 pub fn table(spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
-    let actions = counted_actions(spec)?;
+    let actions = discrete_actions(spec)?;
     match spec.observation {
         Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
         Space::Box { .. } => Err(PolicyError::DiscreteObservationsRequired),
     }
 }
 
-fn counted_actions(spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
+fn discrete_actions(spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.action {
         Space::Discrete { n, .. } => Ok(n as usize),
         Space::Box { .. } => Err(PolicyError::DiscreteActionsRequired),

@@ -73,7 +73,7 @@ impl Scores {
         Self { function, ..self }
     }
 
-    /// The layout of the parameters of [`of`](Self::of).
+    /// The layout of the parameters of [`compute`](Self::compute).
     pub fn layout(&self) -> PolicyLayout {
         match &self.function {
             ScoreFunction::Logits(network) => PolicyLayout::Softmax(*network.layout()),
@@ -96,7 +96,7 @@ impl Scores {
     ///
     /// # Panics
     /// If the slices do not match the layout, or have more observations than the batch.
-    pub fn of(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
+    pub fn compute(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
         let actions = self.actions;
         let (batch, outputs) = match &mut self.function {
             ScoreFunction::Logits(network) | ScoreFunction::Values(network) | ScoreFunction::Dueling(network) => {

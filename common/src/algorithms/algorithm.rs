@@ -50,6 +50,11 @@ pub trait AlgorithmSettings {
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;
 
+    /// A key, beside the shapes, that a run takes over if it begins with networks of these settings, and its value.
+    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+        None
+    }
+
     /// Fills in the key whose default depends on the length of the run, in environment steps, if it is not set. Returns
     /// that key.
     fn set_from_length(&mut self, _steps: u64) -> Option<&'static str> {

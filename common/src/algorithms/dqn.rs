@@ -88,6 +88,11 @@ impl AlgorithmSettings for DqnConfig {
         self.batch
     }
 
+    /// The successor explores as this run did in the end.
+    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+        Some(("epsilon_start", self.epsilon_end.into()))
+    }
+
     fn set_from_length(&mut self, steps: u64) -> Option<&'static str> {
         if self.epsilon_steps != 0 {
             return None;

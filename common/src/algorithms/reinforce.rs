@@ -101,4 +101,9 @@ impl AlgorithmSettings for ReinforceConfig {
     fn batch(&self) -> usize {
         1
     }
+
+    /// Only with a baseline there is a second network.
+    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+        (self.weight == ReturnWeighting::Baseline).then(|| ("weight", "baseline".into()))
+    }
 }

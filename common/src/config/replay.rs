@@ -60,14 +60,14 @@ impl ReplayConfig {
         self.updates_before + (counted as f64 * self.updates_per_step) as u64
     }
 
-    /// Whether a learner with `updates` updates lags behind `rows` environment steps by more than the tolerance, and so
-    /// should take no more of them.
+    /// Whether a learner with `updates` updates is more than the tolerance behind `rows` environment steps, so that it
+    /// must not take more rows.
     pub fn learner_is_behind(&self, rows: u64, updates: u64) -> bool {
         let rows = rows.saturating_sub(self.tolerance);
         rows > self.ratio_start() && self.allowed_updates(rows) > updates
     }
 
-    /// Updates per environment step, both since the ratio counts; `None` before.
+    /// Updates per environment step, both counted from [`ratio_start`](Self::ratio_start) on; `None` before.
     pub fn ratio(&self, updates: u64, env_steps: u64) -> Option<f64> {
         let steps = env_steps.saturating_sub(self.ratio_start());
         (steps > 0).then(|| updates.saturating_sub(self.updates_before) as f64 / steps as f64)

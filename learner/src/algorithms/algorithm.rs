@@ -43,14 +43,13 @@ pub trait Algorithm {
     /// fingerprint with their own.
     fn layout(&self) -> PolicyLayout;
 
-    /// Updates: gradient steps, or consumed rows for `TransitionUse::Transitions` and `Episodes`. These reach the
-    /// number of rows that `update` was called with.
+    /// Updates so far: gradient steps, or consumed rows for `TransitionUse::Transitions` and `Episodes`.
     fn updates(&self) -> u64;
 
-    /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It
-    /// is called while the rows allow more updates than `updates`, which grows with each call. It reads no row from
-    /// `rows` on. A loss that is not finite ends the run.
-    fn update(&mut self, replay: &Replay, rows: u64) -> Losses;
+    /// Makes at least one update from rows before `rows`, and adds what it has made to `updates`. It is called again
+    /// until there are as many updates as those rows allow. An algorithm that consumes rows then has as many as `rows`.
+    /// Returns `None` if nothing was learned from these rows. A loss that is not finite ends the run.
+    fn update(&mut self, replay: &Replay, rows: u64) -> Option<Losses>;
 
     /// Shares the work of updates among these threads from now on, if there is enough of it. The bits of the results do
     /// not depend on them.
@@ -72,7 +71,7 @@ pub type StateArray<'a> = (&'static str, &'a [f32]);
 /// As [`StateArray`], but the numbers can be overwritten.
 pub type StateArrayMut<'a> = (&'static str, &'a mut [f32]);
 
-/// The losses of an update.
+/// What an update reports.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
     /// Error of the value estimates: of the critics, the baseline, or the table. It is the mean squared error, of two
@@ -82,6 +81,8 @@ pub struct Losses {
     pub actor_loss: f32,
     /// Mean of the estimated values, or of the returns if there are no estimates.
     pub q_mean: f32,
+    /// The temperature α with which these losses were computed; `None` for algorithms without one.
+    pub temperature: Option<f32>,
 }
 
 /// The sizes of a run that algorithms depend on.
@@ -151,5 +152,14 @@ impl SavedState {
             found if found == length => Ok(self.0.swap_remove(at).1),
             found => Err(StateArrayError::of_length(name, found, length)),
         }
+    }
+
+    /// As [`take`](Self::take); `None` if it is missing.
+    ///
+    /// # Errors
+    /// When it does not have `length` numbers.
+    pub fn take_if_any(&mut self, name: &str, length: usize) -> Result<Option<Vec<f32>>, StateArrayError> {
+        let exists = self.0.iter().any(|(found, _)| found == name);
+        exists.then(|| self.take(name, length)).transpose()
     }
 }

@@ -13,7 +13,7 @@ use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
@@ -100,6 +100,7 @@ impl Ddpg {
             critic_loss,
             actor_loss,
             q_mean,
+            temperature: None,
         }
     }
 
@@ -215,7 +216,7 @@ impl MinibatchAlgorithm for Ddpg {
         self.threads = threads_for(&self.critic.online.layout, self.y.len(), threads);
     }
 
-    fn learn(&mut self, batch: &Minibatch) -> Losses {
+    fn gradient_step(&mut self, batch: &Minibatch) -> Losses {
         self.update(batch)
     }
 
@@ -243,7 +244,7 @@ impl MinibatchAlgorithm for Ddpg {
 impl AlgorithmDefinition for &config::DdpgConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(ReplaySampling::new(ddpg, config)?))
+        Ok(Box::new(MinibatchLearner::new(ddpg, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

@@ -10,7 +10,7 @@ use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
@@ -70,15 +70,15 @@ impl Dqn {
         let t = self.updates + 1;
         self.evaluate(batch);
         let (loss, q_mean) = self.gradient(batch);
-        self.network.online.descend(&self.threads, t);
+        self.network.online.step(&self.threads, t);
         if t.is_multiple_of(self.settings.target_every) {
             self.network.copy_to_target();
         }
         self.updates = t;
         Losses {
             critic_loss: loss,
-            actor_loss: 0.0,
             q_mean,
+            ..Losses::default()
         }
     }
 
@@ -174,7 +174,7 @@ impl MinibatchAlgorithm for Dqn {
         self.threads = threads_for(&self.network.online.layout, self.settings.batch, threads);
     }
 
-    fn learn(&mut self, batch: &Minibatch) -> Losses {
+    fn gradient_step(&mut self, batch: &Minibatch) -> Losses {
         self.update(batch)
     }
 
@@ -197,7 +197,7 @@ impl MinibatchAlgorithm for Dqn {
 impl AlgorithmDefinition for &config::DqnConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(ReplaySampling::new(dqn, config)?))
+        Ok(Box::new(MinibatchLearner::new(dqn, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

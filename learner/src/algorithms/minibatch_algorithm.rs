@@ -27,7 +27,7 @@ pub trait MinibatchAlgorithm {
 
     /// Takes a gradient step. Nothing is allocated. Panics if the batch has other dimensions than the networks and
     /// settings.
-    fn learn(&mut self, batch: &Minibatch) -> Losses;
+    fn gradient_step(&mut self, batch: &Minibatch) -> Losses;
 
     /// Everything that the next gradient step depends on besides the batch, by name.
     fn state(&self) -> Vec<StateArray<'_>>;
@@ -39,7 +39,7 @@ pub trait MinibatchAlgorithm {
 
 /// An algorithm with its sampling from the replay.
 #[derive(Debug)]
-pub struct ReplaySampling<A> {
+pub struct MinibatchLearner<A> {
     algorithm: A,
     sampler: Sampler,
     batch: Minibatch,
@@ -50,7 +50,7 @@ pub struct ReplaySampling<A> {
     reward_scale: f32,
 }
 
-impl<A: MinibatchAlgorithm> ReplaySampling<A> {
+impl<A: MinibatchAlgorithm> MinibatchLearner<A> {
     /// Samples minibatches for the `algorithm` of a run with this configuration.
     ///
     /// # Errors
@@ -71,7 +71,7 @@ impl<A: MinibatchAlgorithm> ReplaySampling<A> {
     }
 }
 
-impl<A: MinibatchAlgorithm> Algorithm for ReplaySampling<A> {
+impl<A: MinibatchAlgorithm> Algorithm for MinibatchLearner<A> {
     fn policy(&self) -> Cow<'_, [f32]> {
         match &self.normaliser {
             None => self.algorithm.policy().into(),
@@ -87,7 +87,7 @@ impl<A: MinibatchAlgorithm> Algorithm for ReplaySampling<A> {
         self.algorithm.updates()
     }
 
-    fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
+    fn update(&mut self, replay: &Replay, rows: u64) -> Option<Losses> {
         let range = replay.sampling_range(rows, self.capacity);
         self.sampler
             .indices(self.algorithm.updates(), range.clone(), &mut self.indices);
@@ -99,7 +99,7 @@ impl<A: MinibatchAlgorithm> Algorithm for ReplaySampling<A> {
         if self.reward_scale != 1.0 {
             self.batch.r *= self.reward_scale;
         }
-        self.algorithm.learn(&self.batch)
+        Some(self.algorithm.gradient_step(&self.batch))
     }
 
     fn set_threads(&mut self, threads: Threads) {

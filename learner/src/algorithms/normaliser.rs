@@ -11,10 +11,13 @@ use crate::replay::Replay;
 /// Added to a variance before its root is taken.
 const VARIANCE_FLOOR: f64 = 1e-8;
 
-/// Overwrites the row count of a saved state; a new replay counts from `rows`.
-pub(super) fn set_rows(state: &mut [f32], rows: u64) {
-    let halves: [f32; 2] = bytemuck::cast(rows as f64);
-    state.iter_mut().zip(halves).for_each(|(number, half)| *number = half);
+/// Changes the number of rows looked at in a saved state for a new replay that begins with the rows `copied` of the
+/// state's own replay.
+pub(super) fn begin_with_rows(state: &mut [f32], copied: Range<u64>) {
+    let [first, second, ..] = state else { return };
+    let looked_at: f64 = bytemuck::cast([*first, *second]);
+    let of_copied = (looked_at as u64).clamp(copied.start, copied.end) - copied.start;
+    [*first, *second] = bytemuck::cast(of_copied as f64);
 }
 
 /// Mean and variance of the observations in the rows of a replay. Each row is counted once: the state has the number of

@@ -1,5 +1,7 @@
 //! The list of the learning algorithms.
 
+use std::ops::Range;
+
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
@@ -38,7 +40,8 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
 }
 
 /// The state of the algorithm `fresh` with the arrays `weights` of another one's state `saved`. The optimisers start
-/// from their initial state. The statistics of observations already include `rows` rows of its own replay.
+/// from their initial state. The new replay begins with the rows `copied` of the other one; the statistics of
+/// observations include those that the other one had counted.
 ///
 /// # Errors
 /// When the other state lacks a part, or has it in another shape.
@@ -46,7 +49,7 @@ pub fn inherited(
     fresh: &dyn Algorithm,
     weights: &[&str],
     mut saved: SavedState,
-    rows: u64,
+    copied: Range<u64>,
 ) -> Result<Vec<(&'static str, Vec<f32>)>, StateArrayError> {
     let array = |(name, numbers): (&'static str, &[f32])| {
         if !weights.contains(&name) {
@@ -54,7 +57,7 @@ pub fn inherited(
         }
         let mut inherited = saved.take(name, numbers.len())?;
         if name == Normaliser::ARRAY {
-            normaliser::set_rows(&mut inherited, rows);
+            normaliser::begin_with_rows(&mut inherited, copied.clone());
         }
         Ok((name, inherited))
     };
@@ -147,17 +150,21 @@ mod tests {
                 "{sections}"
             );
             // An algorithm inherits its weights, and nothing of the optimiser.
-            let other: Vec<(String, Vec<f32>)> = state
+            let mut other: Vec<(String, Vec<f32>)> = state
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
                 .collect();
-            let begun = inherited(&*algorithm, &weights, SavedState::from(other), 3).unwrap();
+            // It had looked at 6 rows, and rows 4 to 8 are copied.
+            for (_, numbers) in other.iter_mut().filter(|(name, _)| name == Normaliser::ARRAY) {
+                numbers[..2].copy_from_slice(&bytemuck::cast::<f64, [f32; 2]>(6.0));
+            }
+            let begun = inherited(&*algorithm, &weights, SavedState::from(other), 4..9).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
                     name if weights.contains(&name) && name != Normaliser::ARRAY => {
                         assert!(numbers.iter().all(|it| *it == 0.5), "{name}")
                     }
-                    Normaliser::ARRAY => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
+                    Normaliser::ARRAY => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(2.0)),
                     name => assert_eq!(numbers, fresh, "{name}"),
                 }
             }

@@ -52,7 +52,7 @@ impl NetworkWithPass {
 
     /// Takes one step of Adam against the gradient that follows from the first `steps` columns of `d` and the forward
     /// pass before.
-    fn descend(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
+    fn step(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
         self.pass.backward(
             &Threads::SINGLE,
@@ -61,7 +61,7 @@ impl NetworkWithPass {
             &self.d,
             &mut self.network.gradient,
         );
-        self.network.descend(&Threads::SINGLE, t);
+        self.network.step(&Threads::SINGLE, t);
     }
 }
 
@@ -113,14 +113,14 @@ impl Reinforce {
     }
 
     /// Lines 4 to 7 for the episodes of a round, one after another. Returns the means, over episodes and their steps,
-    /// of δ² (0 without a baseline), of −weight · ln π, and of G.
-    fn learn(&mut self, steps: &[Transition<'_>]) -> Losses {
+    /// of δ² (0 without a baseline), of −weight · ln π, and of G; `None` if no episode is learned from.
+    fn learn(&mut self, steps: &[Transition<'_>]) -> Option<Losses> {
         let episodes: Vec<&[Transition<'_>]> = steps
             .split_inclusive(|step| step.last)
             .filter(|episode| self.learns_from(episode))
             .collect();
         if episodes.is_empty() {
-            return Losses::default();
+            return None;
         }
         self.s.fill(0.0);
         for (mut column, step) in self.s.column_iter_mut().zip(episodes.iter().copied().flatten()) {
@@ -167,11 +167,11 @@ impl Reinforce {
         }
         self.steps[0] += 1.0;
         let t = self.steps[0] as u64;
-        self.policy.descend(t, column, &self.s);
+        self.policy.step(t, column, &self.s);
         if let Some(baseline) = &mut self.baseline {
-            baseline.descend(t, column, &self.s);
+            baseline.step(t, column, &self.s);
         }
-        losses
+        Some(losses)
     }
 
     /// Whether an episode is over and, unless `learn_at_limit` is set, was not ended by the time limit.
@@ -245,7 +245,7 @@ impl Algorithm for Reinforce {
         self.rows
     }
 
-    fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
+    fn update(&mut self, replay: &Replay, rows: u64) -> Option<Losses> {
         let layout = replay.layout().row;
         let round: Vec<Transition<'_>> = (self.rows..rows).map(|row| layout.read(replay.row(row))).collect();
         self.rows = rows;

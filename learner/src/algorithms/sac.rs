@@ -19,7 +19,7 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
@@ -72,13 +72,13 @@ impl Draw {
     }
 
     /// The first `cut` samples, and the others.
-    fn split_at(&mut self, cut: usize) -> (MinibatchPart<'_>, MinibatchPart<'_>) {
+    fn split_at(&mut self, cut: usize) -> (DrawPart<'_>, DrawPart<'_>) {
         let width = self.a.nrows();
         let pi = self.pi.samples().split_at(cut);
         let noise = self.noise.as_slice().split_at(cut * width);
         let a = self.a.as_mut_slice().split_at_mut(cut * width);
         let log_pi = self.log_pi.as_mut_slice().split_at_mut(cut);
-        let part = |pi, noise, a, log_pi| MinibatchPart {
+        let part = |pi, noise, a, log_pi| DrawPart {
             width,
             pi,
             noise,
@@ -90,7 +90,7 @@ impl Draw {
 }
 
 /// Some samples of a [`Draw`].
-struct MinibatchPart<'a> {
+struct DrawPart<'a> {
     width: usize,
     pi: Samples<'a>,
     noise: &'a [f32],
@@ -98,7 +98,7 @@ struct MinibatchPart<'a> {
     log_pi: &'a mut [f32],
 }
 
-impl MinibatchPart<'_> {
+impl DrawPart<'_> {
     /// Draws a for each observation of `s` with the policy φ.
     fn draw(&mut self, phi: &[f32], s: &[f32]) {
         let width = self.width;
@@ -173,7 +173,7 @@ impl Temperature {
     }
 
     /// Takes step number `t` against the gradient of −1/N Σ ln α · (ln π(a|s) + H̄).
-    fn descend(&mut self, t: u64, log_pi: &DVector<f32>) {
+    fn step(&mut self, t: u64, log_pi: &DVector<f32>) {
         let gradient = [-mean(log_pi.iter().map(|log_pi| log_pi + self.target_entropy))];
         self.adam.step(&Threads::SINGLE, t, &gradient, &mut self.log_alpha);
     }
@@ -235,7 +235,7 @@ impl Sac {
     }
 
     /// Makes one update with this standard normal noise ε for the actions in s and in s', a column for each sample.
-    /// Returns the sum of the critics' losses, the actor's loss, and the mean of Q₁(s, a) before its step.
+    /// Returns the sum of the critics' losses, the actor's loss, the mean of Q₁(s, a) before its step, and α.
     pub fn update(&mut self, batch: &Minibatch, noise: &DMatrix<f32>, next_noise: &DMatrix<f32>) -> Losses {
         self.now.noise.copy_from(noise);
         self.next.noise.copy_from(next_noise);
@@ -247,7 +247,7 @@ impl Sac {
         self.draw(batch);
         // Both losses below have α from before its step.
         let alpha = self.temperature.alpha();
-        self.temperature.descend(t, &self.now.log_pi);
+        self.temperature.step(t, &self.now.log_pi);
         for (bonus, log_pi) in self.bonus.iter_mut().zip(&self.next.log_pi) {
             *bonus = -alpha * log_pi;
         }
@@ -260,12 +260,13 @@ impl Sac {
             (&self.next.a, &self.bonus),
         );
         let actor_loss = self.actor_gradient(&batch.s, alpha);
-        self.actor.descend(&self.threads, t);
+        self.actor.step(&self.threads, t);
         self.updates = t;
         Losses {
             critic_loss: loss,
             actor_loss,
             q_mean,
+            temperature: Some(alpha),
         }
     }
 
@@ -297,7 +298,7 @@ impl Sac {
         let phi = &*actor.parameters;
         let cut = self.threads.first_share(size);
         let part =
-            |mut draw: MinibatchPart<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
+            |mut draw: DrawPart<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
                 first.forward(s, draw.a);
                 second.forward(s, draw.a);
                 for i in 0..draw.log_pi.len() {
@@ -344,7 +345,7 @@ impl MinibatchAlgorithm for Sac {
         self.threads = threads_for(self.critics.layout(), self.bonus.len(), threads);
     }
 
-    fn learn(&mut self, batch: &Minibatch) -> Losses {
+    fn gradient_step(&mut self, batch: &Minibatch) -> Losses {
         let stream = seek(&mut self.stream, self.updates);
         for noise in [&mut self.now.noise, &mut self.next.noise] {
             noise
@@ -385,7 +386,7 @@ fn names() -> impl Iterator<Item = &'static str> {
 impl AlgorithmDefinition for &config::SacConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(ReplaySampling::new(sac, config)?))
+        Ok(Box::new(MinibatchLearner::new(sac, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

@@ -45,9 +45,9 @@ impl AlgorithmDefinition for TabularDefinition<'_> {
         &Tabular::WEIGHTS
     }
 
-    /// The table, and a pending step for each environment.
+    /// The table, a pending step for each environment, and the two halves of a row's number.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-        self.settings.learned(spec).parameters() + slots(sizes) * PENDING
+        self.settings.learned(spec).parameters() + slots(sizes) * PENDING + 2
     }
 }
 
@@ -67,6 +67,9 @@ pub struct Tabular {
     q: Vec<f32>,
     /// SARSA: for each environment, the [`Pending`] step whose a' is not known yet.
     pending: Vec<f32>,
+    /// The row from which rounds are whole: the last round of a run may be cut off, and the run then get more steps.
+    /// The two halves of a `u64`.
+    slots_from: [f32; 2],
     sizes: RunSizes,
     rows: u64,
 }
@@ -88,6 +91,7 @@ impl Tabular {
     /// Names of the arrays that hold what was learned.
     const WEIGHTS: [&'static str; 1] = ["action-values"];
     const PENDING: &'static str = "steps without successor";
+    const SLOTS_FROM: &'static str = "first row of whole rounds";
 
     /// A table of zeros for an environment like `spec`.
     ///
@@ -107,13 +111,14 @@ impl Tabular {
             actions: scores.actions(),
             q: vec![0.0; scores.layout().parameters()],
             pending: vec![0.0; slots(sizes) * PENDING],
+            slots_from: [0.0; 2],
             sizes,
             rows: 0,
         })
     }
 
-    /// Learns from one transition of the environment in `slot`.
-    fn learn(&mut self, transition: &Transition<'_>, slot: usize) -> Losses {
+    /// Learns from one transition of the environment in `slot`; `None` if nothing could be learned yet.
+    fn learn(&mut self, transition: &Transition<'_>, slot: usize) -> Option<Losses> {
         let step = Pending {
             s: self.state_of(transition.s[0]),
             a: (transition.a[0] as usize).min(self.actions - 1),
@@ -124,18 +129,17 @@ impl Tabular {
         if self.bootstrap == Bootstrap::Max {
             let values = self.values(step.s_next);
             let greatest = values[policy::argmax(values)];
-            return self.update_value(&step, greatest);
+            return Some(self.update_value(&step, greatest));
         }
-        let mut losses = Losses::default();
-        // If the last chunk of a run was cut off and the run then got more steps, the next row is not this step's
-        // successor.
+        let mut losses = None;
+        // The step before may lack its successor, because that was not finite.
         let before = self.take_pending(slot).filter(|before| before.s_next == step.s);
         if let Some(before) = before {
             let value = self.values(before.s_next)[step.a];
-            losses = self.update_value(&before, value);
+            losses = Some(self.update_value(&before, value));
         }
         if step.discount == 0.0 {
-            losses = self.update_value(&step, 0.0);
+            losses = Some(self.update_value(&step, 0.0));
         } else if !transition.last {
             self.put_pending(slot, &step);
         }
@@ -154,8 +158,8 @@ impl Tabular {
         let delta = step.r + bootstrapped - *q;
         let losses = Losses {
             critic_loss: delta * delta,
-            actor_loss: 0.0,
             q_mean: *q,
+            ..Losses::default()
         };
         *q += self.alpha * delta;
         losses
@@ -169,11 +173,17 @@ impl Tabular {
         (observation as usize).min(self.q.len() / self.actions - 1)
     }
 
-    /// The environment of a row: actors take turns with full chunks, and environments take turns within a chunk.
+    /// The environment of a row: from row `slots_from` on, actors take turns with full chunks, and environments take
+    /// turns within a chunk.
     fn slot(&self, row: u64) -> usize {
+        let row = row - self.slots_from();
         let (chunk, actors) = (self.sizes.chunk_rows as u64, u64::from(self.sizes.actors));
         let envs = u64::from(self.sizes.envs);
         (row / chunk % actors * envs + row % chunk % envs) as usize
+    }
+
+    fn slots_from(&self) -> u64 {
+        bytemuck::cast(self.slots_from)
     }
 
     fn take_pending(&mut self, slot: usize) -> Option<Pending> {
@@ -214,7 +224,7 @@ impl Algorithm for Tabular {
         self.rows
     }
 
-    fn update(&mut self, replay: &Replay, _: u64) -> Losses {
+    fn update(&mut self, replay: &Replay, _: u64) -> Option<Losses> {
         // After a crash of a free run the ring may have lost rows since the checkpoint.
         let row = self.rows.max(replay.rows().start);
         if row > self.rows {
@@ -231,13 +241,17 @@ impl Algorithm for Tabular {
             // From an earlier version, which did not check its rows. The step before has lost its
             // successor.
             self.take_pending(slot);
-            return Losses::default();
+            return None;
         }
         self.learn(&replay.layout().row.read(numbers), slot)
     }
 
     fn state(&self) -> Vec<StateArray<'_>> {
-        vec![(Self::WEIGHTS[0], &self.q), (Self::PENDING, &self.pending)]
+        vec![
+            (Self::WEIGHTS[0], &self.q),
+            (Self::PENDING, &self.pending),
+            (Self::SLOTS_FROM, &self.slots_from),
+        ]
     }
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
@@ -245,6 +259,16 @@ impl Algorithm for Tabular {
         // Q-learning has none, and the number of its actors may have changed.
         if self.bootstrap == Bootstrap::NextAction {
             self.pending = saved.take(Self::PENDING, self.pending.len())?;
+            // Earlier versions have not saved it.
+            if let Some([first, second]) = saved.take_if_any(Self::SLOTS_FROM, 2)?.as_deref() {
+                self.slots_from = [*first, *second];
+            }
+            let round = self.sizes.chunk_rows as u64 * u64::from(self.sizes.actors);
+            if !updates.wrapping_sub(self.slots_from()).is_multiple_of(round) {
+                // The last round was cut off. The next rows begin a new one, and follow none of these steps.
+                self.slots_from = bytemuck::cast(updates);
+                self.pending.fill(0.0);
+            }
         }
         self.rows = updates;
         Ok(())

@@ -15,7 +15,7 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
@@ -112,6 +112,7 @@ impl Td3 {
             critic_loss: loss,
             actor_loss: self.actor_loss,
             q_mean,
+            temperature: None,
         }
     }
 
@@ -183,7 +184,7 @@ impl MinibatchAlgorithm for Td3 {
         self.threads = threads_for(self.critics.layout(), self.settings.batch, threads);
     }
 
-    fn learn(&mut self, batch: &Minibatch) -> Losses {
+    fn gradient_step(&mut self, batch: &Minibatch) -> Losses {
         let mut noise = std::mem::replace(&mut self.noise, DMatrix::zeros(0, 0));
         let stream = seek(&mut self.stream, self.updates);
         noise
@@ -219,7 +220,7 @@ impl MinibatchAlgorithm for Td3 {
 impl AlgorithmDefinition for &config::Td3Config {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(ReplaySampling::new(td3, config)?))
+        Ok(Box::new(MinibatchLearner::new(td3, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

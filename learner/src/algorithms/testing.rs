@@ -111,7 +111,7 @@ pub(super) fn assert_threads_do_not_change_the_bits<A: MinibatchAlgorithm>(
         let mut algorithm = new();
         algorithm.set_threads(threads);
         for seed in 0..6 {
-            algorithm.learn(&minibatch(seed, row, size));
+            algorithm.gradient_step(&minibatch(seed, row, size));
         }
         let state = algorithm.state().into_iter();
         state

@@ -154,7 +154,7 @@ impl TwinCritics {
         let q_mean = mean(first.q.output.iter().copied());
         let loss = |critic: &Critic| mean(critic.q.output.iter().zip(&*y).map(|(q, y)| (y - q) * (y - q)));
         let loss = loss(first) + loss(second);
-        let descend = |critic: &mut Critic| {
+        let step = |critic: &mut Critic| {
             let Critic { network, q, d_q, .. } = critic;
             let scale = 2.0 / y.len() as f32;
             for (d, (q, y)) in d_q.iter_mut().zip(q.output.iter().zip(&*y)) {
@@ -164,10 +164,10 @@ impl TwinCritics {
             q.backward(&Threads::SINGLE, &online.parameters, s, d_q, &mut online.gradient);
             match tau {
                 Some(tau) => network.step_with_target(&Threads::SINGLE, t, tau),
-                None => network.online.descend(&Threads::SINGLE, t),
+                None => network.online.step(&Threads::SINGLE, t),
             }
         };
-        threads.both(|| descend(first), || descend(second));
+        threads.both(|| step(first), || step(second));
         CriticLosses { loss, q_mean }
     }
 

@@ -50,7 +50,7 @@ impl TrainableNetwork {
     }
 
     /// Takes step number `t` (from 1) of Adam against the gradient.
-    pub fn descend(&mut self, threads: &Threads, t: u64) {
+    pub fn step(&mut self, threads: &Threads, t: u64) {
         self.adam.step(threads, t, &self.gradient, &mut self.parameters);
     }
 }

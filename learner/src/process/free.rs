@@ -2,13 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_common::algorithms::TransitionUse;
 use shoal_common::exit::Exit;
 use shoal_common::role::Activity;
 
 use super::error::LearnerError;
 use super::evaluation_wait::EvaluationWait;
-use super::learner::Learner;
+use super::learner::{Learner, would_lose_rows};
 
 /// Updates between two publications of the policy. Publishing copies the policy's weights once, which takes about a
 /// thirtieth of an update's time.
@@ -25,15 +24,9 @@ const IDLE_WAIT: Duration = Duration::from_millis(50);
 const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
-    let replay_config = &learner.settings.config.replay;
-    let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
+    let config = &learner.settings.config;
+    let every = Duration::from_secs_f64(config.checkpoint.every_seconds);
     let mut saved = Instant::now();
-    // An algorithm that uses each row once needs all rows that it has not used.
-    let uses_each_once = learner.settings.config.algorithm.properties().transition_use == TransitionUse::Transitions;
-    let (chunk, ring) = (
-        learner.settings.config.chunk_rows() as u64,
-        learner.replay.layout().ring,
-    );
     // After a crash the replay is ahead of the checkpoint. Those rows count.
     learner.advance_to(learner.replay.head());
     loop {
@@ -44,18 +37,15 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         let updates = learner.updates();
         // After the last episode no more rows are taken: a slow learner would never make all the updates that they
         // allow.
-        let drained = !learner.has_all_steps()
+        let took_any = !learner.has_all_steps()
             // After a power loss the replay may have no readable row, although it had many. Then new rows come first.
-            && learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
-                let head = replay.head();
-                let would_lose_rows = uses_each_once
-                    && head + chunk > updates + ring
-                    && replay_config.allowed_updates(head) > updates;
-                !replay.rows().is_empty() && (would_lose_rows || replay_config.learner_is_behind(head, updates))
+            && learner.intake.take_in_turn(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
+                let is_behind = config.replay.learner_is_behind(replay.head(), updates);
+                would_lose_rows(config, replay, updates) || (!replay.rows().is_empty() && is_behind)
             })?;
         learner.advance_to(learner.replay.head());
 
-        if updates < replay_config.allowed_updates(learner.env_steps) && !learner.replay.rows().is_empty() {
+        if updates < config.replay.allowed_updates(learner.env_steps) && !learner.replay.rows().is_empty() {
             learner.update()?;
             // An update may count for several.
             if learner.updates() / PUBLISH_EVERY > updates / PUBLISH_EVERY {
@@ -67,12 +57,12 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION_TIMEOUT));
         } else {
-            let activity = if learner.env_steps < replay_config.ratio_start() {
+            let activity = if learner.env_steps < config.replay.ratio_start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio
             };
-            if !drained {
+            if !took_any {
                 learner.listener.wait(IDLE_WAIT)?;
             }
             learner.refresh_connections(activity)?;

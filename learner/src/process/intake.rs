@@ -119,7 +119,7 @@ impl Intake {
     ///
     /// # Errors
     /// When a channel fails, or a chunk does not belong to this run.
-    pub fn drain(
+    pub fn take_in_turn(
         &mut self,
         replay: &mut Replay,
         most: u32,
@@ -153,7 +153,7 @@ impl Intake {
         Ok(any)
     }
 
-    /// Takes the next chunk of one actor, which is new or was committed before.
+    /// Takes the next chunk of one actor. A chunk that is committed already is dropped.
     ///
     /// # Errors
     /// When the channel fails, or the chunk does not belong to this run.

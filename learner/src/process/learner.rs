@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use shoal_common::algorithms::TransitionUse;
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier};
@@ -41,6 +42,8 @@ struct LossSums {
     critic_loss: f64,
     actor_loss: f64,
     q_mean: f64,
+    /// NaN if the algorithm has none.
+    temperature: f64,
     updates: u64,
 }
 
@@ -49,8 +52,20 @@ impl LossSums {
         self.critic_loss += f64::from(losses.critic_loss);
         self.actor_loss += f64::from(losses.actor_loss);
         self.q_mean += f64::from(losses.q_mean);
+        self.temperature += losses.temperature.map_or(f64::NAN, f64::from);
         self.updates += 1;
     }
+}
+
+/// Whether another chunk might overwrite a row that an update still needs: an algorithm that uses each row once needs
+/// all rows that it has not used. After a power loss there may be no row.
+pub(crate) fn would_lose_rows(config: &Config, replay: &Replay, updates: u64) -> bool {
+    let uses_each_once = config.algorithm.properties().transition_use == TransitionUse::Transitions;
+    let (head, ring) = (replay.head(), replay.layout().ring);
+    uses_each_once
+        && !replay.rows().is_empty()
+        && head + config.chunk_rows() as u64 > updates + ring
+        && config.replay.allowed_updates(head) > updates
 }
 
 /// The state of the learner's process.
@@ -165,13 +180,14 @@ impl<'a> Learner<'a> {
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
         self.heartbeat.begin_work();
-        let losses = self.algorithm.update(&self.replay, self.env_steps);
-        if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
-            return Err(LearnerError::Diverged {
-                updates: self.algorithm.updates(),
-            });
+        if let Some(losses) = self.algorithm.update(&self.replay, self.env_steps) {
+            if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
+                return Err(LearnerError::Diverged {
+                    updates: self.algorithm.updates(),
+                });
+            }
+            self.losses.add(losses);
         }
-        self.losses.add(losses);
         self.heartbeat.count(self.updates() - before);
         Ok(())
     }
@@ -221,18 +237,25 @@ impl<'a> Learner<'a> {
     }
 
     /// Takes the chunks that the actors sent before the end, regardless of the ratio. A resumed run makes the updates
-    /// that they allow.
+    /// that they allow, except those without which rows would be lost.
     pub(crate) fn take_last_chunks(&mut self) -> Result<(), LearnerError> {
         let begun = Instant::now();
         let mut last_chunk_at = begun;
         while last_chunk_at.elapsed() < QUIET_TIME && begun.elapsed() < LAST_CHUNKS_TIMEOUT {
-            if self.intake.drain(&mut self.replay, u32::MAX, |_| false)? {
+            let (config, updates) = (&self.settings.config, self.updates());
+            let took_any = self.intake.take_in_turn(&mut self.replay, u32::MAX, |replay| {
+                would_lose_rows(config, replay, updates)
+            })?;
+            self.advance_to(self.replay.head());
+            if would_lose_rows(config, &self.replay, updates) {
+                self.update()?;
+                last_chunk_at = Instant::now();
+            } else if took_any {
                 last_chunk_at = Instant::now();
             } else {
                 self.listener.wait(Duration::from_millis(10))?;
             }
         }
-        self.advance_to(self.replay.head());
         Ok(())
     }
 
@@ -271,6 +294,7 @@ impl<'a> Learner<'a> {
             critic_loss: losses.critic_loss / updates,
             actor_loss: losses.actor_loss / updates,
             q_mean: losses.q_mean / updates,
+            temperature: losses.temperature / updates,
             averaged: losses.updates,
         });
     }

@@ -135,9 +135,9 @@ impl Replay {
         self.ring.row(index)
     }
 
-    /// Row `index` if its numbers are all finite. Otherwise the next such row of `within`, where the first follows the
-    /// last, or row `index` if there is none. Only rows of earlier versions can have other numbers: learners now check
-    /// chunks before they commit them.
+    /// Row `index` if its numbers are all finite. Otherwise the next finite row of `within`, from its end continuing at
+    /// its beginning, or row `index` if there is none. Only rows of earlier versions can have other numbers: learners
+    /// now check chunks before they commit them.
     ///
     /// # Panics
     /// As [`row`](Self::row).

@@ -73,7 +73,7 @@ impl Host {
                 state: if cut_off {
                     RoleState::Silent
                 } else {
-                    state(role.activity)
+                    role.activity.into()
                 },
                 restarts: 0,
                 rate: if seconds > 0.0 { taken as f64 / seconds } else { 0.0 },
@@ -99,14 +99,5 @@ impl Host {
             silent_seconds: silent.as_secs_f64(),
             roles,
         }
-    }
-}
-
-fn state(activity: Activity) -> RoleState {
-    match activity {
-        Activity::Working => RoleState::Working,
-        Activity::WaitingForPeer | Activity::WaitingForServer => RoleState::WaitingForPeer,
-        Activity::WaitingForRatio => RoleState::WaitingForRatio,
-        Activity::Done => RoleState::Done,
     }
 }

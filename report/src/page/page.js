@@ -232,6 +232,7 @@ function time() {
   chart("Loss of the critic", "critic_loss");
   chart("Loss of the actor", "actor_loss");
   chart("Mean value of the sampled actions (Q)", "q_mean");
+  chart("Temperature", "temperature");
   section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents and changes of the configuration. A horizontal dashed line is the configured ratio."));
 }
 

@@ -114,6 +114,7 @@ struct LearnerCurves {
     critic_loss: Vec<f64>,
     actor_loss: Vec<f64>,
     q_mean: Vec<f64>,
+    temperature: Vec<f64>,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -281,6 +282,7 @@ impl LearnerCurves {
             critic_loss: column(|row| row.critic_loss),
             actor_loss: column(|row| row.actor_loss),
             q_mean: column(|row| row.q_mean),
+            temperature: column(|row| row.temperature),
         }
     }
 }

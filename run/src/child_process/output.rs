@@ -20,7 +20,7 @@ const LAST_OUTPUT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Whose output it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Writer {
+pub enum OutputSource {
     /// Shoal itself: there is no limit.
     Shoal,
     /// Another program, such as the server of an environment.
@@ -53,13 +53,13 @@ impl ChildOutput {
     pub fn read(
         name: &str,
         from: impl Read + Send + 'static,
-        writer: Writer,
+        source: OutputSource,
         take: impl FnMut(Line<'_>) + Send + 'static,
     ) -> io::Result<Self> {
         let (sender, all_read) = mpsc::channel();
         std::thread::Builder::new()
             .name(name.into())
-            .spawn(move || forward(from, Lines::new(writer), take, &sender))?;
+            .spawn(move || forward(from, Lines::new(source), take, &sender))?;
         Ok(Self { all_read })
     }
 
@@ -85,7 +85,7 @@ fn forward(mut from: impl Read, mut lines: Lines, mut take: impl FnMut(Line<'_>)
 
 /// Splits bytes into lines and applies the limits.
 struct Lines {
-    writer: Writer,
+    source: OutputSource,
     line: Vec<u8>,
     /// Bytes dropped from the current line.
     cut: usize,
@@ -96,9 +96,9 @@ struct Lines {
 }
 
 impl Lines {
-    fn new(writer: Writer) -> Self {
+    fn new(source: OutputSource) -> Self {
         Self {
-            writer,
+            source,
             line: Vec::new(),
             cut: 0,
             allowance: BURST,
@@ -108,9 +108,9 @@ impl Lines {
     }
 
     fn add(&mut self, bytes: &[u8], now: Instant, take: &mut impl FnMut(Line<'_>)) {
-        let longest = match self.writer {
-            Writer::Shoal => OWN_LINE,
-            Writer::Program => LINE,
+        let longest = match self.source {
+            OutputSource::Shoal => OWN_LINE,
+            OutputSource::Program => LINE,
         };
         let since = self
             .allowance_updated_at
@@ -134,7 +134,7 @@ impl Lines {
         if self.cut > 0 {
             text += &format!(" … ({} more bytes)", self.cut);
         }
-        if self.writer == Writer::Program && self.allowance < length {
+        if self.source == OutputSource::Program && self.allowance < length {
             self.left_out += 1;
             take(Line::TooMuch(&text));
         } else {
@@ -188,7 +188,7 @@ mod tests {
     }
 
     fn lines_of(pieces: &[&[u8]]) -> Vec<String> {
-        let (mut lines, mut taken) = (Lines::new(Writer::Program), Vec::new());
+        let (mut lines, mut taken) = (Lines::new(OutputSource::Program), Vec::new());
         let now = Instant::now();
         let mut take = |line: Line<'_>| taken.push(kept(line));
         for piece in pieces {
@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn an_endless_line_is_cut_and_takes_bounded_memory() {
-        let mut lines = Lines::new(Writer::Program);
+        let mut lines = Lines::new(OutputSource::Program);
         let (now, mut taken) = (Instant::now(), Vec::new());
         let mut take = |line: Line<'_>| taken.push(kept(line));
         for _ in 0..1000 {
@@ -224,8 +224,8 @@ mod tests {
 
     #[test]
     fn a_flood_is_cut_and_later_lines_are_kept() {
-        let flood = |writer: Writer| {
-            let mut lines = Lines::new(writer);
+        let flood = |source: OutputSource| {
+            let mut lines = Lines::new(source);
             let (now, mut taken, mut last, mut left_out) = (Instant::now(), 0, String::new(), 0);
             let mut take = |line: Line<'_>| match line {
                 Line::Kept(text) => {
@@ -243,11 +243,11 @@ mod tests {
             lines.end(&mut take);
             (taken, last, left_out)
         };
-        let (taken, last, left_out) = flood(Writer::Program);
+        let (taken, last, left_out) = flood(OutputSource::Program);
         assert!(taken < 50_000 && taken + left_out == 200_002, "{taken} {left_out}");
         assert_eq!(last, "later");
         assert_eq!(
-            flood(Writer::Shoal),
+            flood(OutputSource::Shoal),
             (200_002, "later".into(), 0),
             "its own lines are all kept"
         );
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn the_last_line_of_a_flood_is_passed_on() {
-        let (mut lines, mut last) = (Lines::new(Writer::Program), String::new());
+        let (mut lines, mut last) = (Lines::new(OutputSource::Program), String::new());
         let mut take = |line: Line<'_>| {
             if let Line::TooMuch(text) = line {
                 last = text.to_owned();

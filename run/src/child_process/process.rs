@@ -12,7 +12,7 @@ use rustix::thread::{CpuSet, sched_setaffinity};
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 
-use crate::child_process::{ChildGroup, ChildOutput, Line, Writer, role_command};
+use crate::child_process::{ChildGroup, ChildOutput, Line, OutputSource, role_command};
 
 /// How long a process may take to end in order. A learner writes its replay to the disk.
 const END_TIMEOUT: Duration = Duration::from_secs(15);
@@ -76,7 +76,7 @@ impl ChildProcess {
             _ => {}
         };
         peer.output = stderr
-            .map(|stderr| ChildOutput::read("peer", stderr, Writer::Program, keep))
+            .map(|stderr| ChildOutput::read("peer", stderr, OutputSource::Program, keep))
             .transpose()?;
         Ok(peer)
     }

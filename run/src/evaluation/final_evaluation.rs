@@ -1,4 +1,5 @@
-//! The evaluation at the end of a run: `final-evaluation.json` in its directory. Its launcher writes it atomically.
+//! The evaluation at the end of a run: `final-evaluation.json` in its directory. The process that has
+//! the run's lock writes it atomically.
 
 use serde::{Deserialize, Serialize};
 use shoal_common::run_dir::RunDir;

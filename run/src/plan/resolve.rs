@@ -1,8 +1,11 @@
 //! Decides the configuration of a new run: takes the sections of the preset or file, applies the command line, and sets
 //! the keys that follow from both.
 
+use std::path::Path;
+
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, IdentityFormat, explanation};
+use shoal_common::run_dir::RunDir;
 use shoal_env_server::description::Description;
 use toml::{Table, Value};
 
@@ -11,7 +14,7 @@ use super::overrides::{RunOverrides, read_counts, set_key, set_options};
 use super::sections::sections_for_algorithm;
 use super::source::{SettingSource, SettingSources};
 use super::table::{integer, put};
-use crate::origin::shapes;
+use crate::origin::{Origin, shapes};
 use crate::usage::UsageError;
 
 /// The resolved configuration of a preset or a file, without overrides.
@@ -63,6 +66,9 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
         sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
     }
     // A file may be the configuration of another run.
+    if let SettingSource::File(..) = sources.of("run.steps") {
+        subtract_initial_rows(&mut table, Path::new(what))?;
+    }
     for key in explanation::set_by_program() {
         if let Some((section, key)) = key.split_once('.')
             && let Some(Value::Table(values)) = table.get_mut(section)
@@ -102,6 +108,31 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
     })
 }
 
+/// Subtracts the initial rows of the run whose configuration this file is from its steps, which count them too. A new
+/// run with its settings has rows of its own, or none.
+fn subtract_initial_rows(table: &mut Table, file: &Path) -> anyhow::Result<()> {
+    let is_set = |key: &&str| table.get("run").is_some_and(|run| run.get(*key).is_some());
+    if !["from", "demonstrations"].iter().any(is_set) {
+        return Ok(());
+    }
+    let directory = file.parent().unwrap_or(Path::new(""));
+    // `config/used.toml` of a run is one deeper.
+    let run = match directory.file_name() {
+        Some(name) if name == "config" => directory.parent().unwrap_or(Path::new("")),
+        _ => directory,
+    };
+    if let Some(origin) = Origin::read(&RunDir::at(run))?
+        && let Some(steps) = integer(table, "run", "steps")
+    {
+        put(
+            table,
+            &["run", "steps"],
+            steps.saturating_sub_unsigned(origin.rows()).into(),
+        )?;
+    }
+    Ok(())
+}
+
 /// Sets what follows from the run's length if it is left open.
 pub(super) fn set_from_length(config: &mut Config, sources: &mut SettingSources) {
     if let Some(key) = config.algorithm.set_from_length(config.run.steps) {
@@ -136,7 +167,7 @@ fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow
     Ok(())
 }
 
-/// Sets the shapes of the networks of the `--from` run, except keys that the user has set.
+/// Sets the shapes of the networks of the `--from` run, and what else follows from it, except keys that the user has set.
 fn set_from_predecessor(
     table: &mut Table,
     sources: &mut SettingSources,
@@ -150,7 +181,9 @@ fn set_from_predecessor(
         // Networks of another algorithm, which are refused later.
         return Ok(());
     }
-    for (section, key, value) in shapes(&config)? {
+    let more = config.algorithm.settings().for_successor();
+    let more = more.map(|(key, value)| (config.algorithm.name(), key.to_owned(), value));
+    for (section, key, value) in shapes(&config)?.into_iter().chain(more) {
         let name = format!("{section}.{key}");
         if !sources.of(&name).is_from_user() {
             put(table, &[section, &key], value)?;

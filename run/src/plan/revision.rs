@@ -324,6 +324,13 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
             first.key
         );
     }
+    if saved.replay_rows > saved.env_steps && config.run.steps < saved.replay_rows {
+        bail!(
+            "run.steps = {}: must be at least {} now, because the replay of this lockstep run has so many steps already",
+            config.run.steps,
+            saved.replay_rows
+        );
+    }
     if config.run.steps != used.run.steps && saved.replay_rows > saved.env_steps && saved.replay_rows >= used.run.steps
     {
         bail!(

@@ -1,4 +1,5 @@
-//! How a run ended: `outcome.json` in its directory, written atomically by its launcher.
+//! How a run ended: `outcome.json` in its directory, written atomically by the process that has the
+//! run's lock.
 
 use std::fmt;
 
@@ -27,6 +28,8 @@ pub enum OutcomeReason {
     Starting,
     /// The launcher of a running run evaluates its policies once more, without roles.
     FinalEvaluation,
+    /// This signal, in words, has ended the final evaluation of a finished run.
+    EvaluationEnded(String),
     /// Any other reason, in words.
     Other(String),
 }
@@ -34,24 +37,27 @@ pub enum OutcomeReason {
 impl OutcomeReason {
     const STARTING: &str = "starting";
     const FINAL_EVALUATION: &str = "final evaluation";
+    const EVALUATION_ENDED: &str = "the final evaluation was ended by ";
 }
 
 impl fmt::Display for OutcomeReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Starting => Self::STARTING,
-            Self::FinalEvaluation => Self::FINAL_EVALUATION,
-            Self::Other(reason) => reason,
-        })
+        match self {
+            Self::Starting => f.write_str(Self::STARTING),
+            Self::FinalEvaluation => f.write_str(Self::FINAL_EVALUATION),
+            Self::EvaluationEnded(signal) => write!(f, "{}{signal}", Self::EVALUATION_ENDED),
+            Self::Other(reason) => f.write_str(reason),
+        }
     }
 }
 
 impl From<String> for OutcomeReason {
     fn from(reason: String) -> Self {
-        match reason.as_str() {
-            Self::STARTING => Self::Starting,
-            Self::FINAL_EVALUATION => Self::FinalEvaluation,
-            _ => Self::Other(reason),
+        match (reason.as_str(), reason.strip_prefix(Self::EVALUATION_ENDED)) {
+            (Self::STARTING, _) => Self::Starting,
+            (Self::FINAL_EVALUATION, _) => Self::FinalEvaluation,
+            (_, Some(signal)) => Self::EvaluationEnded(signal.to_owned()),
+            (_, None) => Self::Other(reason),
         }
     }
 }

@@ -96,6 +96,9 @@ pub struct LearnerRecord {
     pub env_steps_per_second: Option<f64>,
     /// Updates per environment step after the warm-up.
     pub ratio: Option<f64>,
+    /// Mean temperature α since the previous row; `None` for algorithms without one and in records of earlier versions.
+    #[serde(default)]
+    pub temperature: Option<f64>,
 }
 
 /// Writes the records of a run. Continues those of a resumed run: one header, and seconds that keep counting.
@@ -284,6 +287,7 @@ impl Recorder {
             updates_per_second: rate(|report| report.updates),
             env_steps_per_second: rate(|report| report.env_steps),
             ratio: self.ratio.ratio(report.updates, report.env_steps),
+            temperature: averaged(report.temperature).filter(|temperature| temperature.is_finite()),
         };
         self.env_steps = report.env_steps;
         self.previous = Some((wall, *report));
@@ -295,6 +299,7 @@ impl Recorder {
             ("learner/updates_per_second", row.updates_per_second),
             ("learner/env_steps_per_second", row.env_steps_per_second),
             ("learner/ratio", row.ratio),
+            ("learner/temperature", row.temperature),
         ];
         self.scalars(
             report.env_steps,

@@ -14,12 +14,16 @@ use super::configuration::{overrides_of, requested};
 use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
 use crate::child_process::tied;
+use crate::evaluation::best_policy::evaluate_and_keep_best;
+use crate::evaluation::final_evaluation::FinalEvaluation;
 use crate::files::is_there;
 use crate::interrupted_start::remove_interrupted_start;
 use crate::jobs::{TrainingEnd, run_jobs, run_training, trainings_for_all_cores};
 use crate::plan::{self, Revision, RunOverrides};
 use crate::preflight;
-use crate::signals::Signals;
+use crate::records::outcome::{OutcomeReason, RunOutcome, RunState};
+use crate::records::recorder::record_final;
+use crate::signals::{Signals, describe};
 use crate::status::saved_status;
 
 /// What has happened to the run of the trial with this number.
@@ -93,8 +97,10 @@ pub fn train(
         observer.end_round(round.share, &ended);
     }
     if signals.received().is_none() {
-        let is_due =
-            |trial: &Trial| Ok(!suite.was_ended_early(trial) && !check_finished(suite, &directory.join(&trial.name))?);
+        let is_due = |trial: &Trial| {
+            let run = directory.join(&trial.name);
+            Ok(!suite.was_ended_early(trial) && (!check_finished(suite, &run)? || lacks_evaluation(&run)?))
+        };
         Due::new(suite, directory, is_due, jobs)?.train(signals, None, observer, &mut failed);
     }
     failed.retain(|number| !suite.was_ended_early(&suite.trials[*number]));
@@ -157,7 +163,7 @@ impl<'a> Due<'a> {
             // Its evaluation may come a little later.
             let has_done_enough = || until.is_some_and(|share| share_done(&run) >= share && is_evaluated(&run));
             let interrupted = || signals.received().or_else(|| has_done_enough().then_some(SIGTERM));
-            let trained = train_one(suite, trial, directory, &interrupted);
+            let trained = train_one(suite, trial, directory, signals, &interrupted);
             let _ = events.send(match trained {
                 Ok(TrainingEnd::Finished) => Event::Finished(number),
                 Ok(TrainingEnd::Interrupted) if signals.received().is_none() => Event::Paused(number),
@@ -196,7 +202,7 @@ fn check_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
         return Ok(false);
     }
     let run = RunDir::open(run)?;
-    if run.is_running()? {
+    if run.keeps_running()? {
         let here = run.path().display();
         bail!("{here} is running: end it first, with `shoal stop {here}`");
     }
@@ -210,14 +216,59 @@ fn check_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
     Ok(revision.config.run.has_all_steps(saved.env_steps, saved.episodes))
 }
 
-/// Trains or resumes a run as a process of its own, until it ends or `interrupted` returns a signal.
+/// Whether a signal has ended the final evaluation of this finished run.
+fn lacks_evaluation(run: &Path) -> anyhow::Result<bool> {
+    let outcome = RunOutcome::read(&RunDir::open(run)?)?;
+    let reason = outcome.and_then(|outcome| outcome.reason);
+    Ok(matches!(reason, Some(OutcomeReason::EvaluationEnded(_))))
+}
+
+/// Makes the final evaluation that [`lacks_evaluation`] misses.
+fn evaluate(run: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
+    let run = RunDir::open(run)?.lock()?;
+    let config = run.config()?;
+    let saved = saved_status(&config, &run)?;
+    let outcome = |state| RunOutcome::new(state, saved.env_steps, saved.episodes);
+    outcome(RunState::Running)
+        .with_reason(OutcomeReason::FinalEvaluation)
+        .write(&run)?;
+    let interrupt = signals.interrupt();
+    let evaluated = evaluate_and_keep_best(&config, &run, saved.env_steps, &interrupt, |_, _| ());
+    run.check()?;
+    let finished = outcome(RunState::Finished);
+    match (evaluated, interrupt.signal()) {
+        (Ok(_), _) => {
+            finished.write(&run)?;
+            let result = FinalEvaluation::read(&run, saved.env_steps)?;
+            result.map_or(Ok(()), |result| record_final(&run, &result))?;
+            Ok(TrainingEnd::Finished)
+        }
+        (Err(_), Some(signal)) => {
+            let ended = OutcomeReason::EvaluationEnded(describe(signal));
+            finished.with_reason(ended).write(&run)?;
+            Ok(TrainingEnd::Interrupted)
+        }
+        (Err(error), None) => {
+            let failed = format!("the final evaluation failed: {}", one_line(&error));
+            finished.with_reason(failed).write(&run)?;
+            Err(error)
+        }
+    }
+}
+
+/// Trains or resumes a run as a process of its own, until it ends or `interrupted` returns a signal. A finished run is
+/// evaluated.
 fn train_one(
     suite: &Suite,
     trial: &Trial,
     directory: &Path,
+    signals: &Signals,
     interrupted: &dyn Fn() -> Option<i32>,
 ) -> anyhow::Result<TrainingEnd> {
     let run = directory.join(&trial.name);
+    if is_there(&run)? && check_finished(suite, &run)? {
+        return evaluate(&run, signals);
+    }
     let mut command = Command::new("/proc/self/exe");
     if is_there(&run)? {
         command.arg("resume").arg(&run);

@@ -1,14 +1,28 @@
 //! The actors of this host: which are wanted, and their services, start and retirement.
 
+use std::time::{Duration, Instant};
+
 use shoal_common::channel::Domain;
 use shoal_common::role::{Role, RoleInstance};
+use shoal_common::run_dir::RunDir;
 use shoal_remote::wire::cores;
 use shoal_run::records::recorder::{Incident, IncidentKind};
 
 use super::Supervisor;
 use crate::launcher::child::Child;
+use crate::launcher::local_actors;
 use crate::launcher::process::name;
 use crate::launcher::shares::ActorHost;
+
+/// The pause before it is tried again to create what further actors need.
+const REFUSED_ACTORS_PAUSE: Duration = Duration::from_secs(1);
+
+/// The system refuses what wanted actors need.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RefusedActors {
+    since: Instant,
+    retry_at: Instant,
+}
 
 impl Supervisor {
     /// Changes the wanted number of actors of each host, in the order of [`actor_hosts`](Self::actor_hosts).
@@ -27,6 +41,7 @@ impl Supervisor {
         self.actors_to_take = *here as usize - self.actors.len();
         self.joined_hosts.want(joined);
         self.take_free_actors();
+        self.store_actors();
     }
 
     /// Takes free actors until this host has as many as are wanted. Another host may have to give some up first.
@@ -34,9 +49,28 @@ impl Supervisor {
         if self.actors_to_take > 0 {
             let free = self.free_actors().filter(|index| *index < self.max_actors_here);
             let more: Vec<u32> = free.take(self.actors_to_take).collect();
+            if more.is_empty() {
+                return;
+            }
             self.actors_to_take -= more.len();
             self.actors.extend(more);
             self.actors.sort_unstable();
+            self.store_actors();
+        }
+    }
+
+    /// Stores which actors this host has, for the next launcher. In a lockstep run this follows from the joined hosts.
+    fn store_actors(&self) {
+        let run = RunDir::at(&self.run);
+        // By now another run may be at this path.
+        let is_there = || run.directory_id().is_ok_and(|directory| directory == self.directory);
+        if self.is_learner_host
+            && self.lockstep_actors.is_none()
+            && is_there()
+            && let Err(error) = local_actors::write(&run, &self.actors)
+        {
+            // The run goes on. Only a next launcher may give hosts other actors.
+            self.log.note("launcher", &format!("{error:#}"));
         }
     }
 
@@ -100,11 +134,35 @@ impl Supervisor {
         }
     }
 
-    /// Adds and starts the wanted actors that do not exist, each with its environment server.
+    /// Adds and starts the wanted actors that do not exist, each with its environment server. If the system refuses what
+    /// they need, as it does while too many files are open, it is tried again later.
+    ///
+    /// # Errors
+    /// When the system has refused for too long.
     pub(super) fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.create_wanted_services(domain)?;
+        let now = Instant::now();
+        if self.refused_actors.is_some_and(|refused| now < refused.retry_at) {
+            return Ok(());
+        }
         let missing = self.missing();
-        self.incarnations.reserve(missing.len() as u64)?;
+        let prepared = self
+            .create_wanted_services(domain)
+            .and_then(|()| self.incarnations.reserve(missing.len() as u64));
+        if let Err(error) = prepared {
+            let since = self.refused_actors.map_or(now, |refused| refused.since);
+            if now.duration_since(since) >= self.give_up_after {
+                return Err(error.context("further actors cannot be started"));
+            }
+            let pause = REFUSED_ACTORS_PAUSE;
+            self.log.note(
+                "launcher",
+                &format!("further actors: {error:#}; trying again in {pause:?}"),
+            );
+            let retry_at = now + pause;
+            self.refused_actors = Some(RefusedActors { since, retry_at });
+            return Ok(());
+        }
+        self.refused_actors = None;
         for (role, index) in missing {
             self.children.push(Child::new(role, index));
             self.start(self.children.len() - 1)?;

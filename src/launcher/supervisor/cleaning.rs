@@ -14,6 +14,9 @@ const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 /// to disappear.
 const OCCUPIED_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// How long they may do so while the clean-ups fail.
+const FAILING_TIMEOUT: Duration = Duration::from_secs(20);
+
 /// How soon a clean-up is repeated while they do.
 const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
 
@@ -69,7 +72,12 @@ impl Cleaning {
             return true;
         }
         let since = *self.occupied_since.get_or_insert(begun);
-        cleaned.is_err() || since.elapsed() < OCCUPIED_TIMEOUT
+        let timeout = if cleaned.is_ok() {
+            OCCUPIED_TIMEOUT
+        } else {
+            FAILING_TIMEOUT
+        };
+        since.elapsed() < timeout
     }
 
     /// The time spent on clean-ups since the last call.

@@ -4,10 +4,10 @@ use bincode::config::{self, Config};
 use bincode::error::EncodeError;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use shoal_base::role::Role;
+use shoal_base::role::{Activity, Role};
 
 /// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
-pub(super) const VERSION: u32 = 6;
+pub(super) const VERSION: u32 = 7;
 
 /// A request to a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -179,6 +179,8 @@ pub enum ControlResponse {
     },
     /// The launcher runs this other directory; the one that was asked about is a copy of it.
     AnotherRun(String),
+    /// The request cannot be carried out for the moment, for this reason.
+    NotNow(String),
 }
 
 impl RunStatus {
@@ -294,6 +296,17 @@ pub enum RoleState {
     Restarting,
     /// Finished with all its work.
     Done,
+}
+
+impl From<Activity> for RoleState {
+    fn from(activity: Activity) -> Self {
+        match activity {
+            Activity::Working => Self::Working,
+            Activity::WaitingForPeer | Activity::WaitingForServer => Self::WaitingForPeer,
+            Activity::WaitingForRatio => Self::WaitingForRatio,
+            Activity::Done => Self::Done,
+        }
+    }
 }
 
 /// Encodes a message.

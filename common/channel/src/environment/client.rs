@@ -20,7 +20,7 @@ use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{CLAIM_TIMEOUT, OpenMode, claim};
+use crate::service::{OpenMode, PORT_TIMEOUT, make_port};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -161,7 +161,7 @@ impl EnvironmentClient {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
         let longest = request_length(spec, environments);
-        let (service, client) = claim(|| {
+        let (service, client) = make_port(|| {
             let service = service(domain, &channel, OpenMode::Open)?;
             let client = service
                 .client_builder()
@@ -397,7 +397,7 @@ impl EnvironmentClient {
             }
             if sent.server.is_none() || sent.is_delivered() {
                 unreachable = None;
-            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_TIMEOUT {
+            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= PORT_TIMEOUT {
                 return Err(ChannelError::new(&self.channel, "ask", PeerError::NoConnection).into());
             }
         }

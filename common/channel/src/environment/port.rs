@@ -14,7 +14,7 @@ use super::service::{LOANED_RESPONSES, name, response_length, service};
 use crate::domain::Domain;
 use crate::error::ChannelError;
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{OpenMode, claim};
+use crate::service::{OpenMode, make_port};
 
 /// The server's end.
 #[derive(Debug)]
@@ -49,7 +49,7 @@ impl EnvironmentPort {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let longest = response_length(&spec, environments);
-        let server = claim(|| {
+        let server = make_port(|| {
             service(domain, &channel, OpenMode::Open)?
                 .server_builder()
                 .initial_max_slice_len(longest)

@@ -109,7 +109,7 @@ fn the_target_network_is_copied_after_every_third_update() {
     let mut dqn = algorithm_of(&settings(true, false), 1);
     for t in 1..=7 {
         let before = dqn.network.target.clone();
-        dqn.learn(&minibatch(t, BATCH));
+        dqn.gradient_step(&minibatch(t, BATCH));
         if t.is_multiple_of(3) {
             assert_eq!(*dqn.network.target, *dqn.network.online.parameters, "update {t}");
         } else {
@@ -123,12 +123,12 @@ fn a_restored_algorithm_continues_with_the_same_bits() {
     let settings = settings(true, true);
     let mut dqn = algorithm_of(&settings, 1);
     (0..2).for_each(|seed| {
-        dqn.learn(&minibatch(seed, BATCH));
+        dqn.gradient_step(&minibatch(seed, BATCH));
     });
     let mut restored = Dqn::new(&spec(), &settings, 99).unwrap();
     copy_state(&dqn, &mut restored);
     for algorithm in [&mut dqn, &mut restored] {
-        algorithm.learn(&minibatch(7, BATCH));
+        algorithm.gradient_step(&minibatch(7, BATCH));
     }
     assert_eq!(restored.state(), dqn.state());
 }

@@ -232,7 +232,7 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
         ..settings(ReturnWeighting::Return)
     });
     let before = skips.policy.network.parameters.to_vec();
-    skips.learn(&cut.steps());
+    assert_eq!(skips.learn(&cut.steps()), None);
     assert_eq!(*skips.policy.network.parameters, before);
     assert_eq!(skips.steps, [0.0]);
 

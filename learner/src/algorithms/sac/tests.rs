@@ -131,7 +131,7 @@ fn the_temperature_moves_towards_the_target_entropy() {
     let temperature = |log_pi: f32| {
         let mut sac = algorithm_of(Hidden::relu([9, 7]), 1);
         let before = sac.temperature();
-        sac.temperature.descend(1, &DVector::from_element(BATCH, log_pi));
+        sac.temperature.step(1, &DVector::from_element(BATCH, log_pi));
         sac.temperature() - before
     };
     // The target entropy is −2: at ln π = 2 the entropy is that, below it is higher.
@@ -148,22 +148,25 @@ fn the_value_of_s_next_includes_the_entropy_and_that_of_a_terminal_state_is_not_
     let (batch, mut changed) = (minibatch(1, row(), BATCH), minibatch(1, row(), BATCH));
     assert_eq!(batch.discount[2], 0.0);
     changed.s_next.column_mut(2).fill(f32::NAN);
-    assert_eq!(one.learn(&batch), other.learn(&changed));
+    assert_eq!(one.gradient_step(&batch), other.gradient_step(&changed));
     assert_eq!(one.state(), other.state());
     one.temperature.log_alpha = [-3.0];
-    assert_ne!(one.learn(&batch).critic_loss, other.learn(&batch).critic_loss);
+    assert_ne!(
+        one.gradient_step(&batch).critic_loss,
+        other.gradient_step(&batch).critic_loss
+    );
 }
 
 #[test]
 fn a_restored_algorithm_continues_with_the_same_bits() {
     let mut sac = algorithm_of(Hidden::relu([9, 7]), 1);
     (0..3).for_each(|seed| {
-        sac.learn(&minibatch(seed, row(), BATCH));
+        sac.gradient_step(&minibatch(seed, row(), BATCH));
     });
     let mut restored = Sac::new(&spec(), &settings(Hidden::relu([9, 7])), 1).unwrap();
     copy_state(&sac, &mut restored);
     for algorithm in [&mut sac, &mut restored] {
-        algorithm.learn(&minibatch(7, row(), BATCH));
+        algorithm.gradient_step(&minibatch(7, row(), BATCH));
     }
     assert_eq!(restored.state(), sac.state());
     assert!(sac.temperature() != 1.0 && sac.temperature().is_finite());

@@ -96,9 +96,33 @@ fn a_state_reads_back_and_an_incomplete_one_is_refused() {
     let arrays: Vec<_> = arrays.collect();
     let saved = |arrays: &[_]| SavedState::from(arrays.to_vec());
     let mut new = table(Bootstrap::NextAction, 0.5);
-    new.restore(7, &mut saved(&arrays)).unwrap();
-    assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
-    assert!(new.restore(7, &mut saved(&arrays[1..])).is_err());
+    new.restore(8, &mut saved(&arrays)).unwrap();
+    assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 8));
+    assert!(new.restore(8, &mut saved(&arrays[1..])).is_err());
+}
+
+#[test]
+fn after_a_round_that_was_cut_off_the_next_row_begins_a_new_one() {
+    let saved = |table: &Tabular| {
+        let arrays = table.state().into_iter();
+        let arrays = arrays.map(|(name, numbers)| (name.to_owned(), numbers.to_vec()));
+        SavedState::from(arrays.collect::<Vec<_>>())
+    };
+    let mut old = table(Bootstrap::NextAction, 0.5);
+    teach(&mut old, 3, (0, 1, 4.0, 0.5, 1, false));
+    let waiting = old.pending.clone();
+    // A round has 8 rows: two actors with two environments each, two steps a chunk.
+    let mut new = table(Bootstrap::NextAction, 0.5);
+    new.restore(13, &mut saved(&old)).unwrap();
+    let slots: Vec<usize> = (13..21).map(|row| new.slot(row)).collect();
+    assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3]);
+    assert!(new.pending.iter().all(|number| *number == 0.0));
+    new.pending = waiting.clone();
+    let mut newer = table(Bootstrap::NextAction, 0.5);
+    newer.restore(29, &mut saved(&new)).unwrap();
+    assert_eq!((newer.slot(29), &newer.pending), (0, &waiting), "after whole rounds");
+    newer.restore(31, &mut saved(&new)).unwrap();
+    assert_eq!(newer.slot(31), 0, "after another one that was cut off");
 }
 
 #[test]

@@ -112,7 +112,7 @@ fn policy_and_targets_move_at_every_second_update() {
     let mut td3 = algorithm_of(Hidden::relu([9, 7]), 1);
     let moved = |td3: &mut Td3, seed| {
         let before = td3.clone();
-        td3.learn(&minibatch(seed, row(), BATCH));
+        td3.gradient_step(&minibatch(seed, row(), BATCH));
         let (before, after) = (before.state(), td3.state());
         let changed = before
             .iter()
@@ -129,12 +129,12 @@ fn policy_and_targets_move_at_every_second_update() {
 fn a_restored_algorithm_continues_with_the_same_bits() {
     let mut td3 = algorithm_of(Hidden::relu([9, 7]), 1);
     (0..3).for_each(|seed| {
-        td3.learn(&minibatch(seed, row(), BATCH));
+        td3.gradient_step(&minibatch(seed, row(), BATCH));
     });
     let mut restored = Td3::new(&spec(), &settings(Hidden::relu([9, 7])), 1).unwrap();
     copy_state(&td3, &mut restored);
     for algorithm in [&mut td3, &mut restored] {
-        algorithm.learn(&minibatch(7, row(), BATCH));
+        algorithm.gradient_step(&minibatch(7, row(), BATCH));
     }
     assert_eq!(restored.state(), td3.state());
 }

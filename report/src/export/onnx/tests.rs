@@ -39,7 +39,11 @@ fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usi
     let Policy::Scored(mut scores) = config.policy(batch).unwrap() else {
         panic!("this policy has no scores");
     };
-    scores.of(&policy.parameters, observations).flatten().copied().collect()
+    scores
+        .compute(&policy.parameters, observations)
+        .flatten()
+        .copied()
+        .collect()
 }
 
 #[test]

@@ -51,6 +51,7 @@ fn learner(env_steps: u64, updates: u64, averaged: u64) -> LearnerReport {
         critic_loss: 0.5,
         actor_loss: 20.0,
         q_mean: -20.0,
+        temperature: 0.25,
         averaged,
     }
 }
@@ -87,9 +88,9 @@ fn every_report_becomes_a_row() {
     assert_eq!(
         text(&run.learner_records()),
         "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
-         env_steps_per_second,ratio\n\
-         1.5,1000,0,0,0,,,,,,\n\
-         2.0,2000,0,500,50,0.5,20.0,-20.0,1000.0,2000.0,0.5\n"
+         env_steps_per_second,ratio,temperature\n\
+         1.5,1000,0,0,0,,,,,,,\n\
+         2.0,2000,0,500,50,0.5,20.0,-20.0,1000.0,2000.0,0.5,0.25\n"
     );
     let events = std::fs::read_dir(run.tensorboard()).unwrap().next().unwrap().unwrap();
     assert!(events.metadata().unwrap().len() > 200);
@@ -246,8 +247,8 @@ fn a_table_of_an_earlier_version_gets_the_columns_that_it_lacks() {
         new.lines().collect::<Vec<_>>(),
         [
             "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
-             env_steps_per_second,ratio",
-            "1.5,300,0,20,3,0.25,,-1.0,10.0,20.0,"
+             env_steps_per_second,ratio,temperature",
+            "1.5,300,0,20,3,0.25,,-1.0,10.0,20.0,,"
         ]
     );
     drop(Recorder::open(&run, &without_warmup()).unwrap());

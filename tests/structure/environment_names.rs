@@ -3,7 +3,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::names;
+use shoal_env_server::environment::names;
+
+use crate::root;
 
 /// The directories that are searched. `reproduce` and `bench` are not: they run presets.
 const SEARCHED: [&str; 10] = [
@@ -74,7 +76,7 @@ fn files_below(directory: &Path, into: &mut Vec<PathBuf>) {
 
 #[test]
 fn no_other_crate_refers_to_an_environment_by_name() {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let workspace = root();
     for place in ALLOWED {
         assert!(
             workspace.join(place).exists(),

@@ -24,7 +24,7 @@ use super::{OTHERS_END_TIMEOUT, write_iox_config};
 const TICK: Duration = Duration::from_millis(100);
 
 /// How long actors may take to hand over what they have.
-const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(6);
+const ACTORS_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// How the work for another host's run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,6 +35,8 @@ pub(crate) enum JoinEnd {
     GaveUp,
     /// The host must join again.
     JoinAgain(JoinAgain),
+    /// The run listens at another endpoint now.
+    Moved,
     /// `shoal stop` ended it.
     Stopped,
     /// This signal ended it.
@@ -47,6 +49,8 @@ pub(crate) struct JoinEvents<'a> {
     pub(crate) on_relay_ready: Box<dyn FnOnce() + 'a>,
     /// Asked whether the run is over while the relay has no connection.
     pub(crate) run_is_over: Box<dyn Fn() -> bool + 'a>,
+    /// Asked then whether the run listens at another endpoint.
+    pub(crate) run_has_moved: Box<dyn Fn() -> bool + 'a>,
 }
 
 /// Works for the run until one of these endings. `config` and `run` are those of this host.
@@ -119,15 +123,16 @@ impl<'a> JoinedLauncher<'a> {
         let JoinEvents {
             on_relay_ready,
             run_is_over,
+            run_has_moved,
         } = events;
         // Kept until the end of this function: dropping it gives the host's actors back, and a relay that starts
         // meanwhile still needs them.
         let mut on_relay_ready = Some(on_relay_ready);
-        let ending = self.watch(give_up, &mut on_relay_ready, &run_is_over);
+        let ending = self.watch(give_up, &mut on_relay_ready, (&run_is_over, &run_has_moved));
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try only briefly: its learner accepts no more than it needs.
         match ending {
-            Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::JoinAgain(JoinAgain::LostActors)) => {
+            Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::Moved | JoinEnd::JoinAgain(JoinAgain::LostActors)) => {
                 self.supervisor.ask_to_end(|role| role == Role::Actor)
             }
             _ => self.supervisor.ask_to_retire(Role::Actor),
@@ -138,7 +143,7 @@ impl<'a> JoinedLauncher<'a> {
         );
         self.await_end(
             |role| role == Role::Actor,
-            HAND_OVER_TIMEOUT,
+            ACTORS_HAND_OVER_TIMEOUT,
             hands_over.then_some(Role::Relay),
         );
         self.supervisor.ask_to_end(|_| true);
@@ -146,7 +151,7 @@ impl<'a> JoinedLauncher<'a> {
         self.control.answer_waiting(&ControlResponse::Accepted);
         let ending = match (ending, &self.end_request) {
             // The request came while the actors handed over what they had.
-            (Ok(JoinEnd::JoinAgain(_)), Some(request)) => Ok(request.end),
+            (Ok(JoinEnd::JoinAgain(_) | JoinEnd::Moved), Some(request)) => Ok(request.end),
             (ending, _) => ending,
         };
         if let Err(error) = &ending {
@@ -159,7 +164,7 @@ impl<'a> JoinedLauncher<'a> {
         &mut self,
         give_up: Duration,
         on_relay_ready: &mut Option<Box<dyn FnOnce() + '_>>,
-        run_is_over: &dyn Fn() -> bool,
+        (run_is_over, run_has_moved): (&dyn Fn() -> bool, &dyn Fn() -> bool),
     ) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
@@ -205,6 +210,7 @@ impl<'a> JoinedLauncher<'a> {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
                 Some(Activity::Working) => self.cut_off_since = None,
                 _ if run_is_over() => return Ok(JoinEnd::Over),
+                _ if run_has_moved() => return Ok(JoinEnd::Moved),
                 _ => {
                     let since = self.cut_off_since.get_or_insert_with(Instant::now);
                     if since.elapsed() >= give_up && self.end_request.is_none() {
