@@ -1,5 +1,5 @@
-//! The evaluation at the end of a run: `final-evaluation.json` in its directory. The process that has
-//! the run's lock writes it atomically.
+//! The evaluation at the end of a run: `final-evaluation.json` in its directory, written atomically by the process that
+//! has the run's lock.
 
 use serde::{Deserialize, Serialize};
 use shoal_common::run_dir::RunDir;

@@ -1,5 +1,4 @@
-//! How a run ended: `outcome.json` in its directory, written atomically by the process that has the
-//! run's lock.
+//! How a run ended: `outcome.json` in its directory, written atomically by the process that has the run's lock.
 
 use std::fmt;
 
