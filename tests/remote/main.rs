@@ -459,6 +459,32 @@ fn hosts_wait_for_a_run_that_a_scheduler_ends_and_resumes() {
 }
 
 #[test]
+fn hosts_that_know_the_directory_follow_a_run_that_listens_elsewhere() {
+    let run = Run::start(&["--actors", "1", "--hosts-wait"]);
+    let place = Workplace::logging_chunks();
+    let directory = run.running.run.display().to_string();
+    let join = ["join", &directory, "--local", "host", "--actors", "2"];
+    let host = Host {
+        running: place.launch_command("host", &mut place.shoal(&join)),
+        place,
+    };
+    wait_for_actors(&run, &[1, 2]);
+    let before = run.endpoint();
+    run.running.signal(Signal::TERM);
+    let Run { place, running } = run;
+    assert_eq!(running.wait_for_launcher().0, Some(128 + 15));
+    let running = place.resume("run", &["--listen", "tcp/127.0.0.1:0", "--hosts-wait"]);
+    let run = Run { place, running };
+    assert_ne!(run.endpoint(), before, "a free port");
+    wait_for_actors(&run, &[1, 2]);
+    stop(run);
+    let Host { place, running } = host;
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    let moved = "the run listens on tcp/127.0.0.1:";
+    assert!(place.stderr().contains(moved), "{}", place.stderr());
+}
+
+#[test]
 fn hosts_end_with_a_run_whose_gate_dies_while_it_tells_them() {
     let run = Run::start(&["--actors", "1"]);
     let host = Host::join(&run, &["--actors", "1"]);
