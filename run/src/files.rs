@@ -1,5 +1,6 @@
-//! Files that are looked for before something is decided.
+//! Files that may be there or not.
 
+use std::io::ErrorKind;
 use std::path::Path;
 
 use anyhow::Context;
@@ -12,4 +13,17 @@ use anyhow::Context;
 pub fn is_there(path: &Path) -> anyhow::Result<bool> {
     path.try_exists()
         .with_context(|| format!("cannot look for {}", path.display()))
+}
+
+/// Removes the file at the path, if there is one.
+///
+/// # Errors
+/// When it cannot be removed.
+pub fn remove_if_any(path: &Path) -> anyhow::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(cause) if cause.kind() != ErrorKind::NotFound => {
+            Err(cause).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
 }

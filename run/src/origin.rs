@@ -221,7 +221,7 @@ impl Predecessor {
                 algorithms[0], algorithms[1]
             ));
         }
-        // Two algorithms' configurations may have networks of one shape whose outputs or inputs mean something else.
+        // Networks of one shape may have inputs or outputs of another meaning: normalised, or of dueling heads.
         let shapes = |config: &Config| (config.learned(), config.policy_layout().ok());
         if shapes(old) == shapes(new) {
             return Ok(());

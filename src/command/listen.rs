@@ -22,21 +22,15 @@ const EARLIER_GATE_TIMEOUT: Duration = Duration::from_secs(15);
 fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf> {
     use std::time::SystemTime;
 
-    use anyhow::Context;
     use shoal_remote::files::KeyFile;
     use shoal_remote::keys::{self, VALIDITY};
-    use shoal_run::files::is_there;
+    use shoal_run::files::{is_there, remove_if_any};
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
     if new || !(is_there(&gate)? && is_there(&join)?) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALIDITY)?;
         // If this process is killed in between, one of two keys that do not match must not be left.
-        match std::fs::remove_file(&join) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(error).with_context(|| format!("cannot remove {}", join.display()));
-            }
-            _ => {}
-        }
+        remove_if_any(&join)?;
         keys.gate.write(&gate)?;
         keys.join.write(&join)?;
     }

@@ -22,7 +22,7 @@ use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use shoal_run::records::recorder::record_final;
-use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
+use shoal_run::signals::{Interrupt, Signals, exit_code};
 
 use super::listen::ListenArgs;
 use crate::launcher::{self, RunEnd, RunOptions, TrainingOutcome};
@@ -108,10 +108,7 @@ fn train_and_report(
             }
             Err(error) => {
                 run.check()?;
-                let why = match interrupt.signal() {
-                    Some(signal) => OutcomeReason::EvaluationEnded(describe(signal)),
-                    None => OutcomeReason::Other(format!("the final evaluation failed: {}", one_line(error))),
-                };
+                let why = OutcomeReason::of_missing_evaluation(interrupt.signal(), &error);
                 let here = run.path().display();
                 launcher::note(run, &why.to_string());
                 say(format!(

@@ -2,12 +2,11 @@
 //! joined host may have some of those, with chunks that are not committed yet.
 
 use std::collections::BTreeSet;
-use std::io::ErrorKind;
 
-use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use shoal_common::run_dir::RunDir;
 use shoal_common::versioned_file::VersionedFile;
+use shoal_run::files::remove_if_any;
 
 #[derive(Serialize, Deserialize)]
 struct LocalActors {
@@ -42,12 +41,7 @@ pub(super) fn write(run: &RunDir, actors: &[u32]) -> anyhow::Result<()> {
         let indices = actors.iter().copied().collect();
         return Ok(LocalActors { indices }.store(&file)?);
     }
-    match std::fs::remove_file(&file) {
-        Err(cause) if cause.kind() != ErrorKind::NotFound => {
-            Err(cause).with_context(|| format!("cannot remove {}", file.display()))
-        }
-        _ => Ok(()),
-    }
+    remove_if_any(&file)
 }
 
 #[cfg(test)]

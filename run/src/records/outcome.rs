@@ -3,8 +3,11 @@
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+use shoal_common::message::one_line;
 use shoal_common::run_dir::RunDir;
 use shoal_common::versioned_file::VersionedFile;
+
+use crate::signals::describe;
 
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -37,6 +40,14 @@ impl OutcomeReason {
     const STARTING: &str = "starting";
     const FINAL_EVALUATION: &str = "final evaluation";
     const EVALUATION_ENDED: &str = "the final evaluation was ended by ";
+
+    /// Why a finished run has no final evaluation: this signal has ended it, or otherwise this error.
+    pub fn of_missing_evaluation(signal: Option<i32>, error: &anyhow::Error) -> Self {
+        match signal {
+            Some(signal) => Self::EvaluationEnded(describe(signal)),
+            None => Self::Other(format!("the final evaluation failed: {}", one_line(error))),
+        }
+    }
 }
 
 impl fmt::Display for OutcomeReason {

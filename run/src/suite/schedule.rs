@@ -23,7 +23,7 @@ use crate::plan::{self, Revision, RunOverrides};
 use crate::preflight;
 use crate::records::outcome::{OutcomeReason, RunOutcome, RunState};
 use crate::records::recorder::record_final;
-use crate::signals::{Signals, describe};
+use crate::signals::Signals;
 use crate::status::saved_status;
 
 /// What has happened to the run of the trial with this number.
@@ -236,24 +236,16 @@ fn evaluate(run: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
     let evaluated = evaluate_and_keep_best(&config, &run, saved.env_steps, &interrupt, |_, _| ());
     run.check()?;
     let finished = outcome(RunState::Finished);
-    match (evaluated, interrupt.signal()) {
-        (Ok(_), _) => {
-            finished.write(&run)?;
-            let result = FinalEvaluation::read(&run, saved.env_steps)?;
-            result.map_or(Ok(()), |result| record_final(&run, &result))?;
-            Ok(TrainingEnd::Finished)
-        }
-        (Err(_), Some(signal)) => {
-            let ended = OutcomeReason::EvaluationEnded(describe(signal));
-            finished.with_reason(ended).write(&run)?;
-            Ok(TrainingEnd::Interrupted)
-        }
-        (Err(error), None) => {
-            let failed = format!("the final evaluation failed: {}", one_line(&error));
-            finished.with_reason(failed).write(&run)?;
-            Err(error)
-        }
-    }
+    let Err(error) = evaluated else {
+        finished.write(&run)?;
+        let result = FinalEvaluation::read(&run, saved.env_steps)?;
+        result.map_or(Ok(()), |result| record_final(&run, &result))?;
+        return Ok(TrainingEnd::Finished);
+    };
+    let signal = interrupt.signal();
+    let why = OutcomeReason::of_missing_evaluation(signal, &error);
+    finished.with_reason(why).write(&run)?;
+    signal.map_or(Err(error), |_| Ok(TrainingEnd::Interrupted))
 }
 
 /// Trains or resumes a run as a process of its own, until it ends or `interrupted` returns a signal. A finished run is
