@@ -168,7 +168,7 @@ fn a_process_killed_before_a_call_has_not_made_it() {
 }
 
 fn a_role_killed_before_a_call_is_replaced_and_the_run_completes() {
-    kill_before_some_calls(User::Own, &[Mode::Free], &ROLES, [1, 2, 1]);
+    kill_before_some_calls(User::Own, &[Mode::Free], &ROLES, [1, 1, 1]);
 }
 
 fn an_evaluator_killed_before_a_call_is_replaced() {
@@ -191,7 +191,7 @@ fn a_command_killed_before_a_call_does_not_disturb_its_run() {
 }
 
 fn a_clean_up_killed_before_a_call_is_repeated() {
-    kill_before_some_calls(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 2, 1]);
+    kill_before_some_calls(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 1, 1]);
 }
 
 fn a_python_server_killed_before_a_call_is_replaced() {
