@@ -25,8 +25,14 @@ fn bench(stage: &str, temporary: &Path, seconds: &str) -> Command {
 
 /// Runs a stage briefly and returns the JSON object that it prints as its only line.
 fn figures(stage: &str) -> Value {
+    figures_of(&[stage])
+}
+
+/// The figures of `shoal bench` with these arguments, the first of which is the stage.
+fn figures_of(arguments: &[&str]) -> Value {
+    let (stage, more) = arguments.split_first().unwrap();
     let temporary = TempDir::new().unwrap();
-    let Output { status, stdout, stderr } = output_of(&mut bench(stage, temporary.path(), "0.3"));
+    let Output { status, stdout, stderr } = output_of(bench(stage, temporary.path(), "0.3").args(more));
     let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
     assert!(status.success(), "{stage}: {status}: {stderr}");
     assert_eq!(stdout.lines().count(), 1, "{stdout}");
@@ -110,6 +116,30 @@ fn the_policy_acts_on_one_observation_and_on_batches() {
     assert_eq!((flop / 1e5).round(), 156.0);
     let gflops = flop / number(&figures, "microseconds_per_call_batch_64") / 1e3;
     assert!((share - gflops / limit).abs() < 1e-9 * share, "{figures}");
+}
+
+#[test]
+fn the_policy_of_each_algorithm_is_measured_with_its_exploration() {
+    for (algorithm, inputs_and_outputs) in [("sac", 3 + 2), ("td3", 3 + 1), ("dqn", 4 + 2)] {
+        let figures = figures_of(&["policy", "--method", algorithm]);
+        assert_eq!(figures["method"], algorithm);
+        // Presets of these algorithms have two layers of 256 units.
+        let flop = 2 * 64 * (256 * 256 + 256 * inputs_and_outputs);
+        assert_eq!(figures["flop_batch_64"], flop, "{figures}");
+        let [time, rate, limit, share] = [
+            "microseconds_per_call_exploring",
+            "actions_per_second_exploring",
+            "limit_gflops",
+            "share_of_limit_exploring",
+        ]
+        .map(|field| number(&figures, field));
+        assert!((time * rate / 1e6 - 64.0).abs() < 1e-9 * 64.0, "{figures}");
+        assert!(
+            (share - f64::from(flop) / time / 1e3 / limit).abs() < 1e-9 * share,
+            "{figures}"
+        );
+        assert!(figures["share_of_exploration"].as_f64().unwrap() < 1.0, "{figures}");
+    }
 }
 
 /// The tests above cover the stages one by one. Here all of them run, and each line's verdict follows from its number.

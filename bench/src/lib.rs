@@ -30,7 +30,7 @@ use shoal_run::usage::UsageError;
 
 use self::measurement::{TimeBudget, print};
 
-/// The algorithms that [`Stage::Learner`] can measure, which learn from minibatches.
+/// The algorithms that [`Stage::Learner`] and [`Stage::Policy`] can measure, which learn from minibatches.
 pub fn algorithms() -> impl Iterator<Item = &'static str> {
     AlgorithmConfig::of_minibatches().map(|algorithm| algorithm.name())
 }
@@ -44,7 +44,7 @@ pub enum Stage {
     Transitions,
     /// Round-trip time between an actor process and an environment server process.
     Step,
-    /// Actions per second that the policy network computes.
+    /// Actions per second that the policy chooses, without and with exploration.
     Policy,
     /// Environment steps per second of several actors, environments and learner included, and a prediction for more
     /// actors.
@@ -62,7 +62,8 @@ pub enum Stage {
 }
 
 /// Measures a stage and prints the result, as a table or with `json` also as one JSON object. `actors` lists the
-/// numbers of actors that [`Stage::Actors`] measures, `algorithm` is what [`Stage::Learner`] measures.
+/// numbers of actors that [`Stage::Actors`] measures, `algorithm` is what [`Stage::Learner`] or [`Stage::Policy`]
+/// measures.
 ///
 /// # Errors
 /// If a measured process fails, or the user interrupts.
@@ -71,14 +72,14 @@ pub fn run(stage: Stage, actors: Option<&str>, algorithm: Option<&str>, json: bo
     if actors.is_some() && stage != Stage::Actors {
         return Err(UsageError("--actors is only for `shoal bench actors`".into()).into());
     }
-    if algorithm.is_some() && stage != Stage::Learner {
-        return Err(UsageError("--method is only for `shoal bench learner`".into()).into());
+    if algorithm.is_some() && !matches!(stage, Stage::Learner | Stage::Policy) {
+        return Err(UsageError("--method is only for `shoal bench learner` and `shoal bench policy`".into()).into());
     }
     match stage {
         Stage::Learner => learner::measure(algorithm, &budget).and_then(|it| print(&it, json)),
         Stage::Transitions => transitions::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Step => step::measure(&budget).and_then(|it| print(&it, json)),
-        Stage::Policy => policy::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Policy => policy::measure(algorithm, &budget).and_then(|it| print(&it, json)),
         Stage::Actors => actors::measure(actors, &budget).and_then(|it| print(&it, json)),
         Stage::Run => whole_run::measure(&budget).and_then(|it| print(&it, json)),
         #[cfg(feature = "remote")]

@@ -33,7 +33,7 @@ pub(super) fn measure_all(json: bool, budget: &TimeBudget) -> anyhow::Result<()>
     all.add("learner", &learner::measure(None, budget)?)?;
     all.add("transitions", &transitions::measure(budget)?)?;
     all.add("step", &step::measure(budget)?)?;
-    all.add("policy", &policy::measure(budget)?)?;
+    all.add("policy", &policy::measure(None, budget)?)?;
     all.add("actors", &actors::measure(None, budget)?)?;
     all.add("run", &whole_run::measure(budget)?)?;
     let All { mut stages, lines } = all;

@@ -27,7 +27,7 @@ pub(super) struct TemporaryRun {
     directory: TempDir,
 }
 
-/// The settings of DDPG, which every stage but `learner` measures.
+/// The settings of DDPG, which every stage but `learner` and `policy` measures.
 pub(super) fn ddpg(config: &Config) -> anyhow::Result<&DdpgConfig> {
     config.algorithm.ddpg().context("only DDPG is measured")
 }

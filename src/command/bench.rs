@@ -13,7 +13,7 @@ pub(crate) struct BenchArgs {
     /// at most 64].
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
-    /// With `learner`: the algorithm to measure [default: ddpg].
+    /// With `learner` and `policy`: the algorithm to measure [default: ddpg].
     #[arg(long = "method", value_name = "ALGORITHM", value_parser = PossibleValuesParser::new(shoal_bench::algorithms()))]
     pub(crate) algorithm: Option<String>,
     /// Print one JSON object on standard output.
