@@ -39,7 +39,7 @@ pub(crate) enum Command {
     Train(TrainArgs),
     /// Continue a run that was stopped or killed.
     Resume(ResumeArgs),
-    /// Work for a run of another host: start actors and environment servers here.
+    /// Join a run on another host: start actors and environment servers here.
     Join(JoinArgs),
     /// Show the status of a run: its progress, every process with its rate and restarts, and which role waits for what.
     Status(StatusArgs),
@@ -93,7 +93,7 @@ pub(crate) enum Command {
     InNewSession(InNewSessionArgs),
 }
 
-/// Arguments for this program, started in a new session.
+/// The arguments with which this program is started again in a new session.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct InNewSessionArgs {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]

@@ -12,6 +12,7 @@ mod joined_hosts;
 pub(crate) mod joined_launcher;
 mod local_actors;
 mod log;
+mod predecessors;
 mod process;
 mod progress;
 mod requests;
@@ -22,15 +23,14 @@ mod supervisor;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use shoal_common::channel::Domain;
 use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::reports::{Report, Reports};
-use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::{Config, Mode};
 use shoal_common::message::one_line;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::role::Role;
 use shoal_common::run_dir::{LockedRun, RunDir};
-use shoal_common::stop::GRACE;
 use shoal_run::client::in_final_evaluation;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
@@ -43,6 +43,7 @@ pub(crate) use self::cleaner::run_in_child as run_clean_up;
 use self::end_roles::{EndRequest, EndRoles};
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
+pub(crate) use self::predecessors::{wait_for_predecessors, wait_for_roles_here};
 use self::progress::ProgressLine;
 use self::stall::StallDetector;
 use self::supervisor::{SupervisedHost, Supervisor};
@@ -55,13 +56,14 @@ const SHORTEST_TICK: Duration = Duration::from_millis(20);
 /// If less than this share of a report buffer is filled in a tick, the next tick is longer.
 const LOW_FILL: f64 = 0.1;
 
-/// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
+/// How long the report of the last evaluation may take after the learner is done. The evaluation itself is over by
+/// then: the learner waits for it.
 const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Why a request that needs roles is not carried out while they end and the run may continue with others.
-const ROLES_END: &str = "the processes of the run are ending";
+/// Why a request that needs roles is refused while the roles end and the run may start new ones.
+const ROLES_ARE_ENDING: &str = "the processes of the run are ending";
 
-/// How long actors of a run that is stopped wait until everything is committed, even while there is no learner.
+/// How long the actors of a stopped run may wait for their last chunks to be committed, even while there is no learner.
 const ACTORS_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long actors may take to end after that. In a run that was not stopped, this is all the time they have.
 const ACTORS_END_TIMEOUT: Duration = Duration::from_secs(3);
@@ -70,9 +72,6 @@ const OTHERS_END_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// How long the gate may take to let the other hosts hand over their last chunks.
 const GATE_END_TIMEOUT: Duration = Duration::from_secs(8);
-
-/// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
-const PREDECESSORS_TIMEOUT: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
 /// How often the run may get new shared memory within an hour.
 const MAX_RENEWALS: usize = 5;
@@ -98,11 +97,11 @@ impl RunEnd {
 
 /// Why the roles were ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum RolesEnd {
+enum EndReason {
     /// The run has ended.
     Run(RunEnd),
-    /// Dead processes occupy shared memory that cannot be freed, or another program has removed files of the run: it
-    /// continues in new shared memory.
+    /// The run continues in new shared memory: dead processes occupy the old one permanently, or another program has
+    /// removed files of the run.
     Renewal,
 }
 
@@ -138,50 +137,13 @@ pub(crate) fn run(
     ended.inspect_err(|error| record_failed_start(run, error))
 }
 
-/// Waits until the roles of an earlier launcher, which was killed, have ended. Until then they may read and write the
-/// run's files.
-///
-/// # Errors
-/// When some do not end. That is recorded as the run's outcome.
-pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Result<()> {
-    if Domain::wait_for_earlier_processes(run_id, Duration::ZERO).is_ok() {
-        return Ok(());
-    }
-    if let Some(outcome) = RunOutcome::read(run)?.filter(|outcome| outcome.state == RunState::Running) {
-        // For `shoal status`, which nobody answers until there is a launcher.
-        outcome.with_reason(OutcomeReason::Starting).write(run)?;
-    }
-    let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_TIMEOUT);
-    waited
-        .map_err(|error| name_original_run(error, run))
-        .inspect_err(|error| record_failed_start(run, error))
-}
-
-/// Waits as [`wait_for_predecessors`] does, but records nothing. The roles of another run that this directory is a copy
-/// of do not count: they use their own directory.
-///
-/// # Errors
-/// When some do not end.
-pub(crate) fn wait_for_roles_here(run_id: &str, run: &RunDir) -> anyhow::Result<()> {
-    let is_another = |error: &DomainError| original_run(error, run).is_some();
-    match Domain::wait_for_earlier_processes(run_id, Duration::ZERO) {
-        Err(error) if is_another(&error) => return Ok(()),
-        Ok(()) => return Ok(()),
-        Err(_) => {}
-    }
-    match Domain::wait_for_earlier_processes(run_id, PREDECESSORS_TIMEOUT) {
-        Err(error) if !is_another(&error) => Err(error.into()),
-        _ => Ok(()),
-    }
-}
-
 /// Records that the run has failed, unless a launcher has recorded how it ended.
 fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
     if run.check().is_ok()
         && let Ok(Some(outcome)) = RunOutcome::read(run)
         && outcome.state == RunState::Running
     {
-        // The roles were never started, so no launcher has written how the run ended.
+        // No launcher has recorded an end: the run failed before its roles were started, or between two parts of it.
         let state = RunState::Failed;
         let failed = RunOutcome { state, ..outcome }.with_reason(one_line(error));
         // An error here must not hide the original one.
@@ -189,7 +151,7 @@ fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
     }
 }
 
-/// Runs all roles, again in new shared memory whenever that is needed.
+/// Runs all roles. Starts them again in new shared memory whenever that is needed.
 fn run_and_renew(
     mut config: Config,
     run: &LockedRun,
@@ -201,7 +163,7 @@ fn run_and_renew(
         let part = run_once(config, run, signals, options)?;
         wall += part.wall;
         let before = before.get_or_insert(part.before);
-        if let RolesEnd::Run(ending) = part.ending {
+        if let EndReason::Run(ending) = part.ending {
             return Ok(TrainingOutcome {
                 ending,
                 wall,
@@ -228,7 +190,7 @@ fn run_once(
     run: &LockedRun,
     signals: &Signals,
     options: RunOptions,
-) -> anyhow::Result<TrainingOutcome<RolesEnd>> {
+) -> anyhow::Result<TrainingOutcome<EndReason>> {
     run.check()?;
     let saved = status::saved_status(&config, run)?;
     let starts =
@@ -249,43 +211,15 @@ fn run_once(
     Ok(outcome)
 }
 
-/// If the surviving processes belong to a run that this directory is a copy of, names that run in the error.
-fn name_original_run(error: DomainError, run: &RunDir) -> anyhow::Error {
-    match original_run(&error, run) {
-        Some(there) => {
-            let here = run.path().display();
-            anyhow::anyhow!("{here} is a copy of {there}, which is running: stop that run first")
-        }
-        None => error.into(),
-    }
-}
-
-/// The directory of the surviving processes, if they belong to a run that this directory is a copy of.
-fn original_run(error: &DomainError, run: &RunDir) -> Option<String> {
-    let DomainError::StillAlive { pids, .. } = error else {
-        return None;
-    };
-    // Only roles name their directory in a fixed place: their arguments are role, run directory and two numbers.
-    let directory = |pid: &i32| {
-        let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
-        let arguments = String::from_utf8_lossy(&arguments);
-        let mut arguments = arguments.split('\0').skip(1);
-        let is_role = Role::from_name(arguments.next()?).is_some();
-        arguments.next().filter(|_| is_role).map(str::to_owned)
-    };
-    let here = run.path().display().to_string();
-    pids.iter().find_map(directory).filter(|there| *there != here)
-}
-
 /// What the launcher is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
-    AtWork,
+    Running,
     /// It ends the roles, and the run with them. The other hosts end too.
-    RunEnds,
+    EndingRun,
     /// It ends the roles, but the other hosts wait: the run has failed, moves to new shared memory, or is to be
     /// resumed.
-    RolesEnd,
+    EndingRoles,
 }
 
 struct Launcher<'a> {
@@ -345,7 +279,7 @@ impl<'a> Launcher<'a> {
             control: ControlPort::open(domain, config.actors.max)?,
             initial,
             end_request: None,
-            phase: Phase::AtWork,
+            phase: Phase::Running,
             hosts_wait,
             run,
             domain,
@@ -366,25 +300,26 @@ impl<'a> Launcher<'a> {
         })
     }
 
-    fn run(mut self) -> anyhow::Result<TrainingOutcome<RolesEnd>> {
+    fn run(mut self) -> anyhow::Result<TrainingOutcome<EndReason>> {
         let mut ending = self.watch();
         if let Err(gone) = self.run.check() {
-            // The roles cannot save anything. By now, another run may be at this path, so none may be started either.
-            self.supervisor.kill(|_| true);
+            // The roles can no longer save anything. Another run may be at this path by now, so no role may be started
+            // either.
+            self.supervisor.kill(|_| true, "had lost the run's directory");
             ending = Err(gone.into());
         }
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
         let ended = self.end_all(ending.as_ref().ok().copied());
-        if matches!(ending, Ok(RolesEnd::Renewal))
+        if matches!(ending, Ok(EndReason::Renewal))
             && let Some(request) = self.end_request
         {
-            ending = Ok(RolesEnd::Run(request.end));
+            ending = Ok(EndReason::Run(request.end));
         }
         self.progress.clear();
         self.control.answer_waiting(&match (&ended, &ending) {
             // A request to stop came too late.
-            (Ok(()), Ok(RolesEnd::Run(RunEnd::Finished))) => ControlResponse::Refused(in_final_evaluation(self.run)),
+            (Ok(()), Ok(EndReason::Run(RunEnd::Finished))) => ControlResponse::Refused(in_final_evaluation(self.run)),
             (Ok(()), _) => ControlResponse::Accepted,
             (Err(error), _) => ControlResponse::Refused(format!("{error:#}")),
         });
@@ -393,7 +328,7 @@ impl<'a> Launcher<'a> {
         self.run
             .check()
             .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;
-        let renewed = matches!(ending, Ok(RolesEnd::Renewal));
+        let renewed = matches!(ending, Ok(EndReason::Renewal));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
         if let Some(error) = failure {
             let why = one_line(error);
@@ -406,7 +341,7 @@ impl<'a> Launcher<'a> {
         let ending = ending?;
         // With new shared memory, the learner continues from its newest checkpoint.
         ended.or_else(|error| {
-            if ending == RolesEnd::Renewal {
+            if ending == EndReason::Renewal {
                 Ok(())
             } else {
                 Err(error)
@@ -417,12 +352,12 @@ impl<'a> Launcher<'a> {
         let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            RolesEnd::Run(RunEnd::Stopped) => stopped.with_reason("by request".to_owned()).write(self.run)?,
-            RolesEnd::Run(RunEnd::Interrupted(signal)) => {
+            EndReason::Run(RunEnd::Stopped) => stopped.with_reason("by request".to_owned()).write(self.run)?,
+            EndReason::Run(RunEnd::Interrupted(signal)) => {
                 stopped.with_reason(format!("signal {signal}")).write(self.run)?
             }
             // The final evaluation of a finished run is still to come.
-            RolesEnd::Run(RunEnd::Finished) | RolesEnd::Renewal => {}
+            EndReason::Run(RunEnd::Finished) | EndReason::Renewal => {}
         }
         Ok(TrainingOutcome {
             ending,
@@ -437,7 +372,7 @@ impl<'a> Launcher<'a> {
         Ok(RunOutcome::new(state, saved.env_steps, saved.episodes))
     }
 
-    fn watch(&mut self) -> anyhow::Result<RolesEnd> {
+    fn watch(&mut self) -> anyhow::Result<EndReason> {
         self.run.check()?;
         self.supervisor.start_all(self.domain)?;
         loop {
@@ -447,14 +382,14 @@ impl<'a> Launcher<'a> {
             self.answer_requests()?;
             let condition = match (self.supervisor.maintain(self.domain), self.end_request) {
                 // A run that is about to end needs no role that cannot work.
-                (Err(_), Some(request)) => return Ok(RolesEnd::Run(request.end)),
+                (Err(_), Some(request)) => return Ok(EndReason::Run(request.end)),
                 (condition, _) => condition?,
             };
             match condition {
                 supervisor::RunCondition::AtWork => {}
                 supervisor::RunCondition::LearnerDone => {
                     self.await_last_evaluation()?;
-                    return Ok(RolesEnd::Run(RunEnd::Finished));
+                    return Ok(EndReason::Run(RunEnd::Finished));
                 }
                 supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
                     if self.end_request.is_some() => {}
@@ -476,7 +411,7 @@ impl<'a> Launcher<'a> {
             if let Some(request) = self.end_request
                 && request.may_begin(&self.supervisor, Role::Learner)
             {
-                return Ok(RolesEnd::Run(request.end));
+                return Ok(EndReason::Run(request.end));
             }
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.time_to_next_task()));
@@ -494,12 +429,12 @@ impl<'a> Launcher<'a> {
         }
     }
 
-    /// Logs and prints why the run continues in new shared memory. Returns [`RolesEnd::Renewal`].
-    fn report_renewal(&self, why: &str) -> RolesEnd {
+    /// Logs and prints why the run continues in new shared memory. Returns [`EndReason::Renewal`].
+    fn report_renewal(&self, why: &str) -> EndReason {
         let why = format!("{why}: the run continues in new shared memory");
         self.log.note("launcher", &why);
         self.progress.print(&why);
-        RolesEnd::Renewal
+        EndReason::Renewal
     }
 
     /// Waits for the report on the last period's policy.
@@ -518,16 +453,16 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send. The other hosts are told if
-    /// the run is over, also if a request to end it comes while the roles end. If it is renewed or to be resumed, or
-    /// after an error (`None`), they are not told, and wait for it.
-    fn end_all(&mut self, ending: Option<RolesEnd>) -> anyhow::Result<()> {
+    /// Ends all roles, the actors first, so that the learner still receives what they send. Tells the other hosts if
+    /// the run is over, even if the request to end it arrives while the roles end. They are not told, and wait, if the
+    /// run is renewed or to be resumed, or has failed (`None`).
+    fn end_all(&mut self, ending: Option<EndReason>) -> anyhow::Result<()> {
         let hosts_wait = self.hosts_wait;
         self.phase = match ending {
-            Some(RolesEnd::Run(end)) if end.ends_hosts(hosts_wait) => Phase::RunEnds,
-            _ => Phase::RolesEnd,
+            Some(EndReason::Run(end)) if end.ends_hosts(hosts_wait) => Phase::EndingRun,
+            _ => Phase::EndingRoles,
         };
-        let was_asked = matches!(ending, Some(RolesEnd::Run(RunEnd::Stopped | RunEnd::Interrupted(_))));
+        let was_asked = matches!(ending, Some(EndReason::Run(RunEnd::Stopped | RunEnd::Interrupted(_))));
         let receiver = was_asked.then_some(Role::Learner);
         // A lockstep run collects its unfinished round again, so its actors have nothing to hand over.
         if was_asked && self.config.run.mode == Mode::Free {
@@ -538,8 +473,8 @@ impl<'a> Launcher<'a> {
         self.await_end(|role| role == Role::Actor, ACTORS_END_TIMEOUT, receiver);
         self.take_signal();
         let is_over = |end_request: Option<EndRequest<RunEnd>>| match ending {
-            Some(RolesEnd::Renewal) => end_request.is_some_and(|request| request.end.ends_hosts(hosts_wait)),
-            Some(RolesEnd::Run(end)) => end.ends_hosts(hosts_wait),
+            Some(EndReason::Renewal) => end_request.is_some_and(|request| request.end.ends_hosts(hosts_wait)),
+            Some(EndReason::Run(end)) => end.ends_hosts(hosts_wait),
             None => false,
         };
         let are_told = is_over(self.end_request);
@@ -583,16 +518,16 @@ impl<'a> Launcher<'a> {
         self.recorder.hosts(&self.supervisor.joined_hosts(), wall)?;
         self.supervisor.check_faults()?;
         let fills = [
-            each(&self.episode_reports, |report| {
+            handle_all(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)
             })?,
-            each(&self.evaluation_reports, |report| {
+            handle_all(&self.evaluation_reports, |report| {
                 // A restarted evaluator reports some again.
                 let is_new = self.recorder.evaluated() < Some(report.env_steps);
                 self.progress.set_evaluation(&report, is_new);
                 Ok(self.recorder.evaluation(&report, wall)?)
             })?,
-            each(&self.learner_reports, |report| {
+            handle_all(&self.learner_reports, |report| {
                 self.progress.add_learner_report(&report, wall);
                 Ok(self.recorder.learner(&report, wall)?)
             })?,
@@ -632,6 +567,10 @@ impl EndRoles for Launcher<'_> {
             run.id(),
             run.path(),
             |request| -> anyhow::Result<Option<ControlResponse>> {
+                let run_ends = end_request.is_some_and(|request| request.end.ends_hosts(*hosts_wait));
+                if let Some(answer) = answer_while_ending(*phase, run_ends, &request) {
+                    return Ok(Some(answer));
+                }
                 match request {
                     ControlRequest::Status => Ok(Some(
                         match requests::status(config, run, supervisor, progress, initial) {
@@ -639,21 +578,8 @@ impl EndRoles for Launcher<'_> {
                             Err(error) => ControlResponse::Refused(error.to_string()),
                         },
                     )),
-                    ControlRequest::Scale(_) if *phase == Phase::RunEnds => Ok(Some(ControlResponse::RunIsEnding)),
-                    ControlRequest::Scale(_) if *phase == Phase::RolesEnd => Ok(Some(ControlResponse::Refused(
-                        format!("{ROLES_END}; try again when it continues"),
-                    ))),
                     ControlRequest::Scale(request) => requests::scale(config, run, supervisor, &request, now).map(Some),
-                    ControlRequest::Admit(_)
-                        if *phase == Phase::RunEnds
-                            || end_request.is_some_and(|request| request.end.ends_hosts(*hosts_wait)) =>
-                    {
-                        Ok(Some(ControlResponse::RunIsEnding))
-                    }
-                    ControlRequest::Admit(_) if *phase == Phase::RolesEnd => {
-                        Ok(Some(ControlResponse::NotNow(ROLES_END.into())))
-                    }
-                    // As when too many files are open.
+                    // The launcher may be able to admit the host later, for example when fewer files are open.
                     ControlRequest::Admit(request) => Ok(Some(
                         supervisor
                             .admit(domain, request)
@@ -682,8 +608,22 @@ impl EndRoles for Launcher<'_> {
     }
 }
 
-/// Passes all received reports to `handle`. Returns the fraction of one sender's buffer that they would fill.
-fn each<R: Report>(reports: &Reports<R>, mut handle: impl FnMut(R) -> anyhow::Result<()>) -> anyhow::Result<f64> {
+/// The answer to a request that must not be carried out while the roles end; `None` if it may be. `run_ends` is whether
+/// the run was asked to end, and the other hosts end with it.
+fn answer_while_ending(phase: Phase, run_ends: bool, request: &ControlRequest) -> Option<ControlResponse> {
+    match (request, phase) {
+        (ControlRequest::Scale(_) | ControlRequest::Admit(_), Phase::EndingRun) => Some(ControlResponse::RunIsEnding),
+        (ControlRequest::Admit(_), _) if run_ends => Some(ControlResponse::RunIsEnding),
+        (ControlRequest::Scale(_), Phase::EndingRoles) => Some(ControlResponse::Refused(format!(
+            "{ROLES_ARE_ENDING}; try again when it continues"
+        ))),
+        (ControlRequest::Admit(_), Phase::EndingRoles) => Some(ControlResponse::NotNow(ROLES_ARE_ENDING.into())),
+        _ => None,
+    }
+}
+
+/// Passes all received reports to `handle`. Returns their number as a share of one sender's buffer.
+fn handle_all<R: Report>(reports: &Reports<R>, mut handle: impl FnMut(R) -> anyhow::Result<()>) -> anyhow::Result<f64> {
     let mut count = 0;
     while let Some(report) = reports.receive()? {
         handle(report)?;
@@ -705,4 +645,39 @@ fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
         write().with_context(|| format!("cannot write {}", file.display()))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_common::channel::control::{HostRequest, ScaleRequest};
+
+    use super::*;
+
+    #[test]
+    fn while_the_roles_end_nothing_is_done_that_needs_them() {
+        let scale = ControlRequest::Scale(ScaleRequest::default());
+        let admit = ControlRequest::Admit(HostRequest {
+            host: 7,
+            name: "node".into(),
+            actors: 1,
+            cores: 1,
+            held: Vec::new(),
+        });
+        let is_ending = Some(ControlResponse::RunIsEnding);
+        for request in [&scale, &admit] {
+            assert_eq!(answer_while_ending(Phase::Running, false, request), None);
+            assert_eq!(answer_while_ending(Phase::EndingRun, false, request), is_ending);
+        }
+        assert_eq!(answer_while_ending(Phase::Running, true, &scale), None);
+        for phase in [Phase::Running, Phase::EndingRun, Phase::EndingRoles] {
+            assert_eq!(answer_while_ending(phase, true, &admit), is_ending);
+        }
+        let not_now = answer_while_ending(Phase::EndingRoles, false, &admit);
+        assert!(matches!(not_now, Some(ControlResponse::NotNow(_))), "{not_now:?}");
+        let refused = answer_while_ending(Phase::EndingRoles, true, &scale);
+        assert!(matches!(refused, Some(ControlResponse::Refused(_))), "{refused:?}");
+        for request in [ControlRequest::Status, ControlRequest::Stop] {
+            assert_eq!(answer_while_ending(Phase::EndingRun, true, &request), None);
+        }
+    }
 }

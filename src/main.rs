@@ -69,7 +69,7 @@ fn in_one_line(message: &str) -> String {
             continue;
         }
         if !text.is_empty() {
-            // A list, or what the line before announces.
+            // The line continues the one before it: it is a list of values, or what a colon announces.
             text += if text.ends_with(':') || line.starts_with('[') {
                 " "
             } else {

@@ -1,4 +1,4 @@
-//! One role of a run, in its own process. Reads the run directory and passes each role its settings.
+//! The process of a role: reads the run directory, and starts the role with its settings.
 
 use std::ffi::CString;
 #[cfg(feature = "remote")]
@@ -44,7 +44,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         .with_ansi(false)
         .with_target(false)
         .log_internal_errors(false);
-    // The network engine's own messages do not help readers of a run's log.
+    // Zenoh's own messages do not help readers of a run's log.
     let level = log_level();
     let of_network = if level == LevelFilter::TRACE {
         level

@@ -1,4 +1,4 @@
-//! What `status` and `top` say of a run: its progress, and the tables of its roles and hosts.
+//! How `status` and `top` show a run: its progress, and the tables of its roles and hosts.
 
 use shoal_common::channel::control::{HostState, HostStatus, RoleState, RoleStatus, RunStatus};
 use shoal_run::numbers::thousands;
@@ -24,7 +24,7 @@ pub(crate) fn progress(status: &RunStatus) -> String {
 /// The columns of a table of roles.
 pub(crate) const ROLE_COLUMNS: [&str; 7] = ["role", "pid", "state", "restarts", "rate", "policy", "lag"];
 
-/// What a table says of a role, in the order of [`ROLE_COLUMNS`].
+/// The cells of a role, in the order of [`ROLE_COLUMNS`].
 pub(crate) fn role_cells(role: &RoleStatus) -> [String; 7] {
     let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
     [
@@ -41,7 +41,7 @@ pub(crate) fn role_cells(role: &RoleStatus) -> [String; 7] {
 /// The columns of a table of hosts.
 pub(crate) const HOST_COLUMNS: [&str; 7] = ["host", "state", "actors", "rate", "resent", "round trip", "lag"];
 
-/// What a table says of a host, in the order of [`HOST_COLUMNS`].
+/// The cells of a host, in the order of [`HOST_COLUMNS`].
 pub(crate) fn host_cells(host: &HostStatus) -> [String; 7] {
     let state = match host.state {
         HostState::Connected => "connected".into(),

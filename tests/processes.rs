@@ -246,7 +246,10 @@ fn a_run_whose_directory_is_removed_or_replaced_ends_with_one_line() {
             "{said}"
         );
         assert!(!said.contains("resume"), "{said}");
-        assert!(std::fs::read_to_string(log).unwrap().contains("removed or renamed"));
+        let log = std::fs::read_to_string(log).unwrap();
+        assert!(log.contains("removed or renamed"), "{log}");
+        assert!(log.contains("had lost the run's directory, and was killed"), "{log}");
+        assert!(!log.contains("did not end when asked to"), "{log}");
         assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
         let there = std::fs::read_dir(&run).map_or(0, Iterator::count);
         assert_eq!(

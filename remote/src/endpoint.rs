@@ -24,7 +24,7 @@ enum Protocol {
     Tls,
 }
 
-/// Why a text is not an endpoint.
+/// Why an endpoint cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EndpointError {
     /// It is not written as one.
@@ -32,7 +32,7 @@ pub enum EndpointError {
     Form(String),
     /// Data would cross a network unencrypted.
     #[error("{0} is not an address of this machine alone: without encryption, only 127.0.0.1 and [::1] are allowed")]
-    Open(String),
+    Unencrypted(String),
     /// The system gives no port.
     #[error("cannot listen at {0}: {1}")]
     Port(String, String),
@@ -70,8 +70,8 @@ impl Endpoint {
         })
     }
 
-    /// The endpoint that other hosts connect to, if this one is listened at: all addresses of a machine are reached by
-    /// its name.
+    /// The endpoint that other hosts connect to if the gate listens at this one. If it listens at all addresses, they
+    /// use the machine's name.
     pub fn seen_from_elsewhere(&self, machine: &str) -> Self {
         let all = self.address().is_some_and(|address| address.is_unspecified());
         Self {
@@ -107,7 +107,7 @@ impl FromStr for Endpoint {
         };
         let is_name = !host.is_empty() && host.chars().all(is_plain);
         match (protocol, endpoint.address()) {
-            (Protocol::Tcp, Some(address)) if !address.is_loopback() => Err(EndpointError::Open(text.into())),
+            (Protocol::Tcp, Some(address)) if !address.is_loopback() => Err(EndpointError::Unencrypted(text.into())),
             (Protocol::Tcp, None) => Err(form()),
             (_, Some(IpAddr::V6(_))) if !host.starts_with('[') => Err(form()),
             (_, Some(_)) => Ok(endpoint),
@@ -173,7 +173,7 @@ mod tests {
             assert_eq!(bad.parse::<Endpoint>(), Err(EndpointError::Form(bad.into())));
         }
         for open in ["tcp/0.0.0.0:7447", "tcp/10.0.0.1:7447", "tcp/[::]:1"] {
-            assert_eq!(open.parse::<Endpoint>(), Err(EndpointError::Open(open.into())));
+            assert_eq!(open.parse::<Endpoint>(), Err(EndpointError::Unencrypted(open.into())));
         }
     }
 

@@ -1,4 +1,4 @@
-//! What the gate forwards to the learner: of each actor exactly the next chunk, whatever the network does.
+//! What the gate forwards to the learner: exactly the next chunk of each actor, whatever the network does.
 //!
 //! Chunks are identified by the incarnation and the sequence number in their headers, and ordered by both. A handshake,
 //! the first chunk of an incarnation, has sequence number 0. The relay sends it once all chunks before it are committed

@@ -47,7 +47,8 @@ use crate::wire::{
 const SHORTEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(1);
 const LONGEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
 
-/// How long to sleep while chunks wait to be committed: at first, and at most while nothing is committed.
+/// How long to sleep at first while chunks wait to be committed. The sleep doubles, up to [`LONGEST_SLEEP`], while
+/// nothing is committed.
 const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 
 /// How often the launcher gets the status of the hosts.
@@ -146,7 +147,7 @@ struct Gate<'a> {
     session: Session,
     arrivals: Receiver<Arrival>,
     requests: LauncherRequests<PendingRequest>,
-    /// Of the launcher; `None` before its first answer.
+    /// The launcher's epoch; `None` before its first answer.
     epoch: Option<u64>,
     hosts: HashMap<u64, Host>,
     actors: HashMap<u32, RemoteActor>,
@@ -160,8 +161,11 @@ struct Gate<'a> {
     episodes: Reporter<EpisodeReport>,
     /// The number of the last acknowledgement.
     acknowledgements_sent: u64,
-    /// When something wrong was last named.
+    /// When [`warn`](Self::warn) last logged something.
     warned_at: Option<Instant>,
+    /// When a refused connection was last logged. A host with a wrong key connects again and again, which must not hide
+    /// other warnings.
+    connection_warned_at: Option<Instant>,
     /// The line about the last host that was refused, and when it was written.
     last_refusal: Option<(Instant, String)>,
     started_at: Instant,
@@ -228,6 +232,7 @@ impl<'a> Gate<'a> {
             episodes: Reporter::open(domain)?,
             acknowledgements_sent: 0,
             warned_at: None,
+            connection_warned_at: None,
             last_refusal: None,
             started_at: Instant::now(),
             over_since: None,
@@ -313,8 +318,8 @@ impl<'a> Gate<'a> {
             return Ok(0);
         };
         host.heard_at = Instant::now();
-        // Processes of a host that was admitted again may have incarnations of an earlier lease.
-        let ours = chunk.header.incarnation < host.lease.limit;
+        // There is no lower bound: a host that was admitted again may have processes of an earlier lease.
+        let is_of_host = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
         let forwarder = if self.settings.config.actors.has_own_service(chunk.header.actor) {
             &actor.forwarder
@@ -325,13 +330,12 @@ impl<'a> Gate<'a> {
             return Ok(0);
         };
         let parts = forwarder.parts(&chunk.header, &chunk.numbers);
-        if !(ours && parts.is_some_and(|(rows, _)| are_finite(rows))) {
-            // The host repeats it again and again.
-            if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
-                host.warned_at = Some(Instant::now());
+        if !(is_of_host && parts.is_some_and(|(rows, _)| are_finite(rows))) {
+            // The host sends it again and again, so the warnings are limited.
+            if may_warn(&mut host.warned_at) {
                 tracing::warn!(
-                    "host {} sent an invalid chunk of actor {} (of another shape, with a number that is not finite, or by an \
-                     earlier lease); it is ignored",
+                    "host {} sent an invalid chunk of actor {} (of another shape, with a number that is not finite, or with \
+                     an incarnation that the host was not given); it is ignored",
                     host.lease.name,
                     chunk.header.actor
                 );
@@ -352,7 +356,7 @@ impl<'a> Gate<'a> {
             // The empty acknowledgement makes it ask to be admitted.
             return self.acknowledge_nothing(report.host);
         };
-        (host.heard_at, host.is_known) = (Instant::now(), true);
+        (host.heard_at, host.has_contacted) = (Instant::now(), true);
         if report.number <= host.last_report {
             return Ok(());
         }
@@ -367,7 +371,7 @@ impl<'a> Gate<'a> {
                 && known.insert((role.role, role.index))
         });
         for role in &report.roles {
-            // The learner then opens the actor's own service.
+            // This heartbeat makes the learner open the actor's own service.
             let has_own_service = self.settings.config.actors.has_own_service(role.index);
             if role.role == Role::Actor && has_own_service {
                 self.heartbeats.send(role.heartbeat());
@@ -395,29 +399,7 @@ impl<'a> Gate<'a> {
             Ok(hello) => hello.with_plain_texts(),
             Err(error) => return answer_join(&query, &Admission::Refused(error.to_string())),
         };
-        if hello.program != env!("CARGO_PKG_VERSION") {
-            let why = format!(
-                "this host has version {} of the program, the learner's host {}: install the same version on both",
-                hello.program,
-                env!("CARGO_PKG_VERSION")
-            );
-            return self.refuse(&query, &hello.name, why);
-        }
-        let (theirs, ours) = (&hello.instructions, vector_instructions());
-        if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
-            let why = format!(
-                "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
-                 would not have the same bits; join from a host with the same ones"
-            );
-            return self.refuse(&query, &hello.name, why);
-        }
-        let words = self.replay.layout().actor_snapshot_words;
-        let most = MAX_SNAPSHOT_WORDS.checked_div(words).unwrap_or(usize::MAX);
-        if hello.actors as usize > most {
-            let why = format!(
-                "the snapshots of {} actors are too large for one host: it may have {most}",
-                hello.actors
-            );
+        if let Some(why) = self.reason_to_refuse(&hello) {
             return self.refuse(&query, &hello.name, why);
         }
         let request = HostRequest {
@@ -432,6 +414,32 @@ impl<'a> Gate<'a> {
             PendingRequest::Join(Box::new(query), hello),
         );
         Ok(())
+    }
+
+    /// Why a host cannot be admitted, whatever the launcher says.
+    fn reason_to_refuse(&self, hello: &Hello) -> Option<String> {
+        if hello.program != env!("CARGO_PKG_VERSION") {
+            return Some(format!(
+                "this host has version {} of the program, the learner's host {}: install the same version on both",
+                hello.program,
+                env!("CARGO_PKG_VERSION")
+            ));
+        }
+        let (theirs, ours) = (&hello.instructions, vector_instructions());
+        if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
+            return Some(format!(
+                "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
+                 would not have the same bits; join from a host with the same ones"
+            ));
+        }
+        let words = self.replay.layout().actor_snapshot_words;
+        let most = MAX_SNAPSHOT_WORDS.checked_div(words).unwrap_or(usize::MAX);
+        (hello.actors as usize > most).then(|| {
+            format!(
+                "the snapshots of {} actors are too large for one host: it may have {most}",
+                hello.actors
+            )
+        })
     }
 
     /// Refuses a host. It may ask again every second, so the log repeats a line only after [`WARNING_INTERVAL`].
@@ -459,8 +467,7 @@ impl<'a> Gate<'a> {
 
     /// Warns, but at most once in [`WARNING_INTERVAL`]: a host may repeat the same fault without end.
     fn warn(&mut self, what: fmt::Arguments<'_>) {
-        if self.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
-            self.warned_at = Some(Instant::now());
+        if may_warn(&mut self.warned_at) {
             tracing::warn!("{what}");
         }
     }
@@ -496,10 +503,10 @@ impl<'a> Gate<'a> {
                 (Ok(ControlResponse::NotNow(why)) | Err(why), PendingRequest::Join(_, hello)) => {
                     self.warn(format_args!("host {} is not admitted for now: {why}", hello.name));
                 }
-                (answer, PendingRequest::Join(query, hello)) => {
+                (Ok(answer), PendingRequest::Join(query, hello)) => {
                     let why = match answer {
-                        Ok(ControlResponse::Refused(why)) | Err(why) => why,
-                        Ok(other) => format!("the launcher gave an unexpected answer: {other:?}"),
+                        ControlResponse::Refused(why) => why,
+                        other => format!("the launcher gave an unexpected answer: {other:?}"),
                     };
                     self.refuse(&query, &hello.name, why)?;
                 }
@@ -551,7 +558,7 @@ impl<'a> Gate<'a> {
             acknowledged_at: now,
             acknowledgement_due: true,
             heard_at: now,
-            is_known: asks,
+            has_contacted: asks,
             last_report: report,
             has_left: false,
             newest_report: None,
@@ -739,10 +746,10 @@ impl<'a> Gate<'a> {
             return Ok(());
         }
         self.connections_refreshed_at = Instant::now();
-        if let Some(why) = refused::take() {
-            self.warn(format_args!(
-                "a connection was refused: {why}; only hosts with the run's join.key are let in"
-            ));
+        if let Some(why) = refused::take()
+            && may_warn(&mut self.connection_warned_at)
+        {
+            tracing::warn!("a connection was refused: {why}; only hosts with the run's join.key are let in");
         }
         self.forget_released();
         self.policies.refresh()?;
@@ -775,32 +782,40 @@ impl<'a> Gate<'a> {
     }
 }
 
+/// Whether there was no warning for [`WARNING_INTERVAL`]. The caller must then warn: this is noted as a warning.
+fn may_warn(warned_at: &mut Option<Instant>) -> bool {
+    let may = warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL);
+    if may {
+        *warned_at = Some(Instant::now());
+    }
+    may
+}
+
 /// Declares what the gate receives. The session keeps the declarations.
 fn declare(session: &Session, run_id: &str, arrivals: &Sender<Arrival>) -> Result<(), NetworkError> {
     // A callback fails only while the gate ends.
-    let to = |arrivals: &Sender<Arrival>| arrivals.clone();
-    let sender = to(arrivals);
+    let sender = arrivals.clone();
     session
         .declare_subscriber(network::chunks(run_id, "*"))
         .callback(move |sample| drop(sender.send(Arrival::Chunk(sample.payload().to_bytes().into_owned()))))
         .background()
         .wait()
         .map_err(failed("receive chunks"))?;
-    let sender = to(arrivals);
+    let sender = arrivals.clone();
     session
         .declare_subscriber(network::reports(run_id, "*"))
         .callback(move |sample| drop(sender.send(Arrival::Report(sample.payload().to_bytes().into_owned()))))
         .background()
         .wait()
         .map_err(failed("receive reports"))?;
-    let sender = to(arrivals);
+    let sender = arrivals.clone();
     session
         .declare_queryable(network::join(run_id))
         .callback(move |query| drop(sender.send(Arrival::Join(query))))
         .background()
         .wait()
         .map_err(failed("receive join requests"))?;
-    let sender = to(arrivals);
+    let sender = arrivals.clone();
     session
         .declare_queryable(network::policy(run_id))
         .callback(move |query| drop(sender.send(Arrival::Policy(query))))

@@ -84,7 +84,7 @@ impl LeaseKeeper {
                     has_heard.store(true, Ordering::Relaxed);
                 }
             };
-            // Without it, only the relay hears of the run's end.
+            // If this fails, the host learns of the run's end only from its relay.
             let _subscriber = connection
                 .0
                 .declare_subscriber(network::acknowledgements(&run_id, host))
@@ -155,8 +155,9 @@ impl Drop for LeaseKeeper {
     }
 }
 
-/// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `timeout` is over, or `stop` returns
-/// true; also after a refusal, if `ask_again` returns true for its reason. The connection is for a [`LeaseKeeper`].
+/// Asks the gate at this endpoint to admit this host. Asks again until there is an answer, `timeout` is over or `stop`
+/// returns true; also after a refusal, if `ask_again` returns true for its reason. With a key, only the gate of the
+/// key's run is asked. The connection is for a [`LeaseKeeper`].
 ///
 /// # Errors
 /// When there is no answer, or it cannot be read.
@@ -172,7 +173,7 @@ pub fn join(
     let begun = Instant::now();
     let may_wait = || begun.elapsed() < timeout && !stop();
     loop {
-        // Without a key nobody knows which run it is, and only one can be there.
+        // Without a key the run's id is not known. Only one run can listen at an endpoint.
         match ask_to_join(&session, key.map_or("*", |key| &key.run_id), hello) {
             Err(JoinError::Silence { .. }) if may_wait() => std::thread::sleep(RETRY_INTERVAL),
             Err(JoinError::Silence { .. }) => {

@@ -31,7 +31,7 @@ pub struct Keys {
     pub join: KeyFile,
 }
 
-/// Makes the keys of run `run_id`, which are valid until `end`, or a day later.
+/// Makes the keys of run `run_id`. They are valid at least until `end`, and at most a day longer.
 ///
 /// # Errors
 /// When the system gives no random numbers.

@@ -27,7 +27,7 @@ const THREADS: (&str, &str) = (
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), net: (handover: app))",
 );
 
-/// Gate or relay is away if nothing has come from it for this long.
+/// Gate or relay counts as cut off if nothing has come from it for this long.
 pub(crate) const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// How long gate and relay wait for news before they look at everything again.
@@ -100,6 +100,7 @@ pub(crate) fn reports(run_id: &str, host: &str) -> String {
 
 /// Acknowledgements for a host.
 pub(crate) fn acknowledgements(run_id: &str, host: u64) -> String {
+    // `marks` belongs to the wire format, whose number another word would change.
     format!("shoal/{run_id}/down/{host}/marks")
 }
 
@@ -109,13 +110,13 @@ pub(crate) fn acknowledgements(run_id: &str, host: u64) -> String {
 /// # Errors
 /// When the endpoint is taken, or the key cannot be used.
 pub fn listen(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, NetworkError> {
-    let mut ours = vec![
+    let mut settings = vec![
         ("listen/endpoints", json!([endpoint])),
         ("transport/unicast/max_sessions", json!(10_000)),
         ("transport/unicast/accept_pending", json!(10_000)),
     ];
     if let Some(key) = key {
-        ours.push((
+        settings.push((
             "transport/link/tls",
             json!({
                 "root_ca_certificate_base64": STANDARD.encode(&key.authority),
@@ -124,9 +125,9 @@ pub fn listen(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, Net
                 "enable_mtls": true,
             }),
         ));
-        ours.push(("access_control", access(&key.run_id)));
+        settings.push(("access_control", access(&key.run_id)));
     }
-    open(&ours, "listen")
+    open(&settings, "listen")
 }
 
 /// What hosts may do. Everything else is denied.
@@ -144,7 +145,7 @@ fn access(run_id: &str) -> serde_json::Value {
             &["declare_subscriber"],
             std::slice::from_ref(&down),
         ),
-        rule("marks", "egress", &["put"], &[down]),
+        rule("acknowledgements", "egress", &["put"], &[down]),
         rule("answers", "egress", &["reply"], &questions),
         rule("receive", "egress", &["declare_subscriber"], &[up]),
         rule("be-asked", "egress", &["declare_queryable"], &questions),
@@ -165,7 +166,7 @@ fn access(run_id: &str) -> serde_json::Value {
 /// # Errors
 /// When the key cannot be used.
 pub fn connect(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, NetworkError> {
-    let mut ours = vec![
+    let mut settings = vec![
         ("connect/endpoints", json!([endpoint])),
         ("listen/endpoints", json!([])),
         ("connect/timeout_ms", json!(-1)),
@@ -176,7 +177,7 @@ pub fn connect(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, Ne
         ),
     ];
     if let Some(key) = key {
-        ours.push((
+        settings.push((
             "transport/link/tls",
             json!({
                 "root_ca_certificate_base64": STANDARD.encode(&key.authority),
@@ -188,17 +189,17 @@ pub fn connect(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, Ne
             }),
         ));
     }
-    open(&ours, "connect")
+    open(&settings, "connect")
 }
 
-fn open(ours: &[(&str, serde_json::Value)], action: &'static str) -> Result<Session, NetworkError> {
+fn open(settings: &[(&str, serde_json::Value)], action: &'static str) -> Result<Session, NetworkError> {
     if !has_one_thread() {
         let cause = format!("{} must be {}", THREADS.0, THREADS.1);
         return Err(NetworkError { action, cause });
     }
     let mut config = Config::default();
     let common = [
-        // A client would not begin before it is connected.
+        // In Zenoh's client mode, a session would not open before it is connected.
         ("mode", json!("peer")),
         // Nothing but the endpoint is ever contacted.
         ("scouting/multicast/enabled", json!(false)),
@@ -208,7 +209,7 @@ fn open(ours: &[(&str, serde_json::Value)], action: &'static str) -> Result<Sess
         // Acknowledgements must not wait in the kernel behind a policy.
         ("transport/link/tcp/so_sndbuf", json!(65536)),
     ];
-    for (key, value) in common.iter().chain(ours) {
+    for (key, value) in common.iter().chain(settings) {
         config
             .insert_json5(key, &value.to_string())
             .map_err(failed("be configured"))?;

@@ -22,8 +22,8 @@ impl RateLimiter {
         }
     }
 
-    /// Takes `amount` tokens if any are there, and returns whether it did. The amount may be larger than the number of
-    /// tokens. That becomes negative then, so the next amount has to wait longer.
+    /// Takes `amount` tokens if any are there, and returns whether it did. The amount may exceed what is available. The
+    /// balance then becomes negative, and the next amount waits longer.
     pub fn take(&mut self, amount: f64, now: Instant) -> bool {
         let refilled = self.available + self.rate * now.saturating_duration_since(self.refilled_at).as_secs_f64();
         self.available = refilled.min(self.rate * BURST.as_secs_f64());

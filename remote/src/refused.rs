@@ -1,5 +1,5 @@
-//! What the network engine notes about connections that it refuses. It does so in its own words, and once for each
-//! attempt. The gate logs it in ours, and not more often than it logs other warnings.
+//! Connections that Zenoh refuses. Zenoh logs each attempt in its own words. The gate logs them in Shoal's, and not
+//! more often than other warnings.
 
 use std::fmt::{Debug, Write};
 use std::sync::{Mutex, PoisonError};
@@ -15,10 +15,10 @@ use tracing_subscriber::registry::LookupSpan;
 /// Why the last connection was refused, since [`take`] was last called.
 static LAST: Mutex<Option<String>> = Mutex::new(None);
 
-/// The part of a program's log that listens to the network engine.
+/// The layer of a program's log that takes Zenoh's warnings.
 pub fn layer<S: Subscriber + for<'a> LookupSpan<'a>>() -> impl Layer<S> {
-    let of_engine = Targets::new().with_target("zenoh_link_tls", LevelFilter::WARN);
-    Refused.with_filter(of_engine)
+    let of_zenoh = Targets::new().with_target("zenoh_link_tls", LevelFilter::WARN);
+    Refused.with_filter(of_zenoh)
 }
 
 /// Why a connection was refused, if one was since the last call.
@@ -32,7 +32,7 @@ impl<S: Subscriber> Layer<S> for Refused {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let mut message = Message::default();
         event.record(&mut message);
-        // The engine suspects a lack of descriptors behind every refusal.
+        // Zenoh adds a hint about file descriptors to every refusal, which does not apply here.
         let why = message.0.split(". Hint").next().unwrap_or_default().to_owned();
         *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some(why);
     }

@@ -112,14 +112,14 @@ enum Arrival {
     Admission(Result<Admission, String>),
 }
 
-/// Wakes the relay's loop after an arrival.
+/// Sends arrivals to the relay's loop, and wakes it.
 #[derive(Clone)]
-struct Wake {
+struct ArrivalSender {
     arrivals: Sender<Arrival>,
     event: Arc<OwnedFd>,
 }
 
-impl Wake {
+impl ArrivalSender {
     fn send(&self, arrival: Arrival) {
         // Both fail only while the relay ends, or if the counter of wake-ups is full, which wakes it as well.
         let _ = self.arrivals.send(arrival);
@@ -141,7 +141,7 @@ struct Relay<'a> {
     stop: &'a Stop,
     session: Session,
     listener: Listener,
-    wake: Wake,
+    arrival_sender: ArrivalSender,
     arrivals: Receiver<Arrival>,
     requests: LauncherRequests<()>,
     chunk_queue: SyncSender<ZBytes>,
@@ -219,11 +219,11 @@ impl<'a> Relay<'a> {
         let (sender, arrivals) = channel();
         let event =
             eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(system_error("create an event"))?;
-        let wake = Wake {
+        let arrival_sender = ArrivalSender {
             arrivals: sender,
             event: Arc::new(event),
         };
-        let to = wake.clone();
+        let to = arrival_sender.clone();
         session
             .declare_subscriber(network::acknowledgements(&host.run_id, host.host))
             .callback(move |sample| to.send(Arrival::Acknowledgement(sample.payload().to_bytes().into_owned())))
@@ -237,7 +237,7 @@ impl<'a> Relay<'a> {
             .wait()
             .map_err(failed("send reports"))?;
         let newest = NewestPolicy::default();
-        start_asking_for_policies(&session, host, wake.clone(), newest.clone())?;
+        start_asking_for_policies(&session, host, arrival_sender.clone(), newest.clone())?;
         let now = Instant::now();
         Ok(Self {
             chunk_queue: start_sending(&session, host)?,
@@ -250,7 +250,7 @@ impl<'a> Relay<'a> {
             stop,
             session,
             listener,
-            wake,
+            arrival_sender,
             arrivals,
             report_publisher: reports,
             mirror,
@@ -356,7 +356,7 @@ impl<'a> Relay<'a> {
         let confirmed = self
             .unconfirmed_report
             .take_if(|(number, _)| *number <= acknowledgement.report);
-        // If a later report is confirmed, this one was lost, or its acknowledgement.
+        // If a later report is confirmed, this one or its acknowledgement was lost.
         if let Some((_, sent)) = confirmed.filter(|(number, _)| *number == acknowledgement.report) {
             self.round_trip = Some(sent.elapsed());
         }
@@ -387,12 +387,12 @@ impl<'a> Relay<'a> {
                 changed.push(of_actor.actor);
             }
             lost |= follow_up == ActorFollowUp::TakenOver;
-            start_again(&self.requests, of_actor.actor, follow_up);
+            request_restart(&self.requests, of_actor.actor, follow_up);
         }
         if lost {
-            self.lose_actors();
+            self.report_lost_actors();
         } else if acknowledgement.wanted_actors != self.actors.len() as u32 {
-            self.scale(acknowledgement.wanted_actors);
+            self.report_wanted_actors(acknowledgement.wanted_actors);
         }
         if other_gate || !changed.is_empty() {
             let of_host = acknowledgement.actors.iter();
@@ -407,7 +407,7 @@ impl<'a> Relay<'a> {
     }
 
     /// Tells the launcher of this host that its actors belong to others now, so that the host joins again.
-    fn lose_actors(&mut self) {
+    fn report_lost_actors(&mut self) {
         if self.lost_actors_at.is_none_or(|told| told.elapsed() >= REJOIN_INTERVAL) {
             tracing::warn!("the run has given the actors of this host to others");
             self.lost_actors_at = Some(Instant::now());
@@ -418,7 +418,7 @@ impl<'a> Relay<'a> {
 
     /// Tells the launcher of this host that the run wants it to have another number of actors, so that the host joins
     /// again.
-    fn scale(&mut self, actors: u32) {
+    fn report_wanted_actors(&mut self, actors: u32) {
         if self.scaled_at.is_none_or(|told| told.elapsed() >= REJOIN_INTERVAL) {
             tracing::info!("the run wants this host to have {actors} actors");
             self.scaled_at = Some(Instant::now());
@@ -450,10 +450,11 @@ impl<'a> Relay<'a> {
             cores: cores(),
             held: host.actors.clone(),
         };
-        let (session, wake, run_id) = (self.session.clone(), self.wake.clone(), host.run_id.clone());
+        let (session, run_id) = (self.session.clone(), host.run_id.clone());
+        let arrival_sender = self.arrival_sender.clone();
         let ask = move || {
             let answer = ask_to_join(&session, &run_id, &hello).map_err(|error| error.to_string());
-            wake.send(Arrival::Admission(answer));
+            arrival_sender.send(Arrival::Admission(answer));
         };
         if let Err(cause) = std::thread::Builder::new().name("join".into()).spawn(ask) {
             tracing::warn!("cannot ask to be admitted again: {cause}");
@@ -473,7 +474,7 @@ impl<'a> Relay<'a> {
                 host.epoch = lease.epoch;
                 host.write(&self.settings.run)?;
             }
-            Ok(Admission::Admitted(_)) => self.lose_actors(),
+            Ok(Admission::Admitted(_)) => self.report_lost_actors(),
             Ok(Admission::Refused(why)) => {
                 tracing::warn!("not admitted again: {why}");
                 self.is_refused = true;
@@ -513,7 +514,7 @@ impl<'a> Relay<'a> {
                 let (rows, snapshot) = chunk.parts();
                 let bytes = WireChunk::encode(self.settings.host.host, chunk.header(), rows, snapshot);
                 let follow_up = actor.uncommitted.add(id_of(chunk.header()), bytes.into(), now);
-                start_again(&self.requests, *index, follow_up);
+                request_restart(&self.requests, *index, follow_up);
                 self.heartbeat.count(chunk.header().rows.into());
             }
         }
@@ -582,7 +583,7 @@ impl<'a> Relay<'a> {
             .wait()
             .map_err(failed("send a report"))?;
         if leaving {
-            // The process ends next, and with it what has not left it.
+            // The process ends next. Closing the session first sends what is still queued.
             self.session.close().wait().map_err(failed("close"))?;
         }
         Ok(())
@@ -595,7 +596,7 @@ impl<'a> Relay<'a> {
         self.connections_refreshed_at = Instant::now();
         if self.lost_actors_at.is_some() {
             // The launcher may not have got the first message.
-            self.lose_actors();
+            self.report_lost_actors();
         }
         if let Some(publisher) = &self.policy_publisher {
             publisher.refresh_connections()?;
@@ -609,12 +610,12 @@ impl<'a> Relay<'a> {
         Ok(())
     }
 
-    /// Waits for an actor or the gate, for a while.
+    /// Waits at most [`LONGEST_SLEEP`] for an actor or the gate.
     fn sleep(&self) -> Result<(), RelayError> {
         let timeout = Timespec::try_from(LONGEST_SLEEP).ok();
         let mut ready = [
             PollFd::from_borrowed_fd(self.listener.as_fd(), PollFlags::IN),
-            PollFd::from_borrowed_fd(self.wake.event.as_fd(), PollFlags::IN),
+            PollFd::from_borrowed_fd(self.arrival_sender.event.as_fd(), PollFlags::IN),
         ];
         match poll(&mut ready, timeout.as_ref()) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
@@ -622,7 +623,7 @@ impl<'a> Relay<'a> {
         }
         let mut count = [0; 8];
         // It fails if there was no arrival.
-        let _ = rustix::io::read(&self.wake.event, &mut count);
+        let _ = rustix::io::read(&self.arrival_sender.event, &mut count);
         self.listener.wait(Duration::ZERO)?;
         Ok(())
     }
@@ -636,10 +637,10 @@ fn system_error<E: Into<std::io::Error>>(action: &'static str) -> impl Fn(E) -> 
     }
 }
 
-/// Restarts an actor whose chunks the replay has lost.
-fn start_again(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
-    if let ActorFollowUp::StartAgain(incarnation) = follow_up {
-        tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
+/// Asks the launcher of this host to restart an actor whose chunks the replay has lost.
+fn request_restart(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
+    if let ActorFollowUp::Restart(incarnation) = follow_up {
+        tracing::warn!("the replay has lost chunks of actor {actor}; the actor is restarted");
         requests.ask(ControlRequest::Replace { actor, incarnation }, ());
     }
 }
@@ -684,7 +685,7 @@ impl NewestPolicy {
 fn start_asking_for_policies(
     session: &Session,
     host: &HostFile,
-    wake: Wake,
+    arrival_sender: ArrivalSender,
     newest: NewestPolicy,
 ) -> Result<(), RelayError> {
     let (session, key, host) = (session.clone(), network::policy(&host.run_id), host.host);
@@ -706,7 +707,7 @@ fn start_asking_for_policies(
                 std::thread::sleep(POLICY_PAUSE);
                 continue;
             };
-            wake.send(Arrival::Policy(sample.payload().to_bytes().into_owned()));
+            arrival_sender.send(Arrival::Policy(sample.payload().to_bytes().into_owned()));
             // The next request names this policy, so it waits until it is published here.
             let asked = Instant::now();
             while newest.get() == have && asked.elapsed() < POLICY_QUERY_TIMEOUT {

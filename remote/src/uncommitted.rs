@@ -16,7 +16,7 @@ pub enum ActorFollowUp {
     Continue,
     /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has.
     /// End the actor unless it has a later incarnation than this; its successor begins with a handshake.
-    StartAgain(u64),
+    Restart(u64),
     /// A process of another host has committed chunks with the actor's index: this host has lost its actors.
     TakenOver,
 }
@@ -101,7 +101,7 @@ impl<C> UncommittedChunks<C> {
         }
         let follows = id.incarnation == self.newest_added.incarnation && id.sequence - self.newest_added.sequence == 1;
         if id.sequence > 0 && !follows {
-            return ActorFollowUp::StartAgain(id.incarnation);
+            return ActorFollowUp::Restart(id.incarnation);
         }
         let mut previous = self.newest_added;
         // An actor that ended before its handshake was committed has sent nothing else.
@@ -148,7 +148,7 @@ impl<C> UncommittedChunks<C> {
                 resent: self.resent,
                 ..Self::new(committed)
             };
-            return ActorFollowUp::StartAgain(ended);
+            return ActorFollowUp::Restart(ended);
         }
         if forwarded > self.forwarded {
             self.progress_at = now;
@@ -181,7 +181,7 @@ impl<C> UncommittedChunks<C> {
         }
     }
 
-    /// Goes back to the first chunk that the gate has not forwarded: it is another process than before.
+    /// Goes back to the first chunk that the gate has not forwarded. Call it when the gate was restarted.
     pub fn go_back(&mut self, now: Duration) {
         self.next_to_send = self.chunks.partition_point(|kept| kept.id <= self.forwarded);
         self.progress_at = now;

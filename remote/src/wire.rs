@@ -501,8 +501,8 @@ impl Message for HostReport {
 /// The most bytes that a message decodes to. The limit keeps a damaged length from allocating memory without bound.
 const MAX_MESSAGE_BYTES: usize = 4 << 20;
 
-/// The most words of all snapshots of a host's actors: an acknowledgement has all of them. A word takes 9 bytes at most,
-/// and some room is left for the rest.
+/// The most words that the snapshots of a host's actors may have together: one acknowledgement carries them all. An
+/// encoded word has at most 9 bytes; the rest of the message needs some room too.
 pub const MAX_SNAPSHOT_WORDS: usize = MAX_MESSAGE_BYTES / 10;
 
 fn encoding() -> impl bincode::config::Config {

@@ -86,21 +86,22 @@ fn a_foreign_or_expired_key_or_that_of_the_gate_opens_nothing() {
 }
 
 #[test]
-fn a_host_may_send_chunks_and_receive_marks_and_nothing_else() {
+fn a_host_may_send_chunks_and_receive_acknowledgements_and_nothing_else() {
     restart_with_one_thread().unwrap();
     let keys = fresh();
     let endpoint = endpoint();
     let gate = listen(&endpoint, Some(&keys.gate)).unwrap();
     let up = counting(&gate, "shoal/1a2b/up/**", "chunk");
-    let [forged_marks, other_run] = ["shoal/1a2b/down/**", "shoal/other/**"].map(|key| counting(&gate, key, "forged"));
+    let [forged_acknowledgements, other_run] =
+        ["shoal/1a2b/down/**", "shoal/other/**"].map(|key| counting(&gate, key, "forged"));
     let host = connect(&endpoint, Some(&keys.join)).unwrap();
-    let marks = counting(&host, "shoal/1a2b/down/7/marks", "marks");
+    let acknowledgements = counting(&host, "shoal/1a2b/down/7/marks", "acknowledgement");
     let second = connect(&endpoint, Some(&keys.join)).unwrap();
     let [of_others, everything] = ["shoal/1a2b/up/**", "**"].map(|key| counting(&second, key, "secret"));
     let allowed = within(60, || {
         host.put("shoal/1a2b/up/7/chunks", "chunk").wait().unwrap();
-        gate.put("shoal/1a2b/down/7/marks", "marks").wait().unwrap();
-        up.load(Ordering::Relaxed) > 0 && marks.load(Ordering::Relaxed) > 0
+        gate.put("shoal/1a2b/down/7/marks", "acknowledgement").wait().unwrap();
+        up.load(Ordering::Relaxed) > 0 && acknowledgements.load(Ordering::Relaxed) > 0
     });
     assert!(allowed);
     let before = up.load(Ordering::Relaxed);
@@ -112,7 +113,11 @@ fn a_host_may_send_chunks_and_receive_marks_and_nothing_else() {
         std::thread::sleep(Duration::from_millis(50));
     }
     assert!(up.load(Ordering::Relaxed) > before, "the second host is connected");
-    assert_eq!(forged_marks.load(Ordering::Relaxed), 0, "forged marks arrive");
+    assert_eq!(
+        forged_acknowledgements.load(Ordering::Relaxed),
+        0,
+        "forged acknowledgements arrive"
+    );
     assert_eq!(other_run.load(Ordering::Relaxed), 0, "chunks of another run arrive");
     let read = of_others.load(Ordering::Relaxed) + everything.load(Ordering::Relaxed);
     assert_eq!(read, 0, "a host reads what another sends");

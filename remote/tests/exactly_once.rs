@@ -328,11 +328,11 @@ impl World {
 
     fn follow_up_on(&mut self, follow_up: ActorFollowUp) {
         match follow_up {
-            ActorFollowUp::StartAgain(incarnation) if self.actor.incarnation <= incarnation => {
+            ActorFollowUp::Restart(incarnation) if self.actor.incarnation <= incarnation => {
                 assert!(self.may_have_lost);
                 self.start_actor();
             }
-            ActorFollowUp::Continue | ActorFollowUp::StartAgain(_) => {}
+            ActorFollowUp::Continue | ActorFollowUp::Restart(_) => {}
             ActorFollowUp::TakenOver => unreachable!("nobody else has this actor"),
         }
     }

@@ -153,7 +153,7 @@ impl RunClient {
         match answer {
             None => Ok(None),
             Some(ControlResponse::Status(status)) => Ok(Some(status)),
-            Some(other) => bail!("the launcher gave an unexpected answer: {other:?}"),
+            Some(other) => Err(not_accepted(other)),
         }
     }
 

@@ -2,7 +2,8 @@
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
-use std::io::{Read, Seek, Write};
+use std::io::Write;
+use std::os::unix::fs::FileExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
@@ -33,7 +34,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Printed<'a> {
+struct DetachedJson<'a> {
     run: &'a Path,
     /// The process id of the launcher.
     pid: u32,
@@ -85,7 +86,7 @@ fn start_detached(
 ) -> anyhow::Result<ExitCode> {
     let path = std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))?;
     let here = path.display();
-    let mut messages = tempfile::tempfile().context("cannot make a temporary file")?;
+    let messages = tempfile::tempfile().context("cannot make a temporary file")?;
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal").arg(COMMAND).args(["resume", "--quiet"]);
     command.args(arguments).arg("--").arg(&path);
@@ -111,12 +112,12 @@ fn start_detached(
                 is_over = true;
                 break;
             }
-            write_messages(&mut messages)?;
+            write_messages(&messages)?;
             let code = status.code().and_then(|code| u8::try_from(code).ok());
             return Ok(code.map_or(ExitCode::FAILURE, ExitCode::from));
         }
         if begun.elapsed() >= timeout {
-            write_messages(&mut messages)?;
+            write_messages(&messages)?;
             end(child);
             bail!(
                 "{here} did not start within {} s and is being stopped; see shoal.log in that directory",
@@ -125,7 +126,7 @@ fn start_detached(
         }
         std::thread::sleep(POLL_INTERVAL);
     }
-    write_messages(&mut messages)?;
+    write_messages(&messages)?;
     if !output.quiet {
         let what = match is_over {
             true => "is over already".into(),
@@ -137,7 +138,7 @@ fn start_detached(
         say(format!("{here} {what}"));
     }
     if output.json {
-        let printed = serde_json::to_string(&Printed { run: &path, pid })?;
+        let printed = serde_json::to_string(&DetachedJson { run: &path, pid })?;
         writeln!(std::io::stdout(), "{printed}")?;
     }
     Ok(ExitCode::SUCCESS)
@@ -151,10 +152,15 @@ fn end(child: Child) {
 }
 
 /// Shows what the launcher has written so far: warnings, how to join, or its error.
-fn write_messages(messages: &mut File) -> anyhow::Result<()> {
-    let mut text = Vec::new();
-    messages.rewind()?;
-    messages.read_to_end(&mut text)?;
+fn write_messages(messages: &File) -> anyhow::Result<()> {
+    let (mut text, mut part) = (Vec::new(), [0; 4096]);
+    // The launcher writes at the offset of this file, so reading must not move it.
+    loop {
+        match messages.read_at(&mut part, text.len() as u64)? {
+            0 => break,
+            read => text.extend_from_slice(&part[..read]),
+        }
+    }
     // As in `say`.
     let _ = std::io::stderr().write_all(&text);
     Ok(())

@@ -1,4 +1,4 @@
-//! `shoal join`: works for a run of another host.
+//! `shoal join`: joins a run on another host.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -63,10 +63,10 @@ pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
         std::io::stdout().lock().write_all(template.text().as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let (Some(run), Some(actors)) = (&args.run, args.actors) else {
+    let (Some(place), Some(actors)) = (&args.run, args.actors) else {
         anyhow::bail!("name a run to join, and a number of actors");
     };
-    join(args, run, actors)
+    join(args, place, actors)
 }
 
 /// Reads a time such as `90s`, `10min` or `2h`.
@@ -86,7 +86,7 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
 }
 
 #[cfg(not(feature = "remote"))]
-fn join(_args: &JoinArgs, _run: &str, _actors: u32) -> anyhow::Result<ExitCode> {
+fn join(_args: &JoinArgs, _place: &str, _actors: u32) -> anyhow::Result<ExitCode> {
     anyhow::bail!(shoal_remote::NOT_BUILT)
 }
 
@@ -119,7 +119,7 @@ mod with_network {
     /// The exit code if the run could not be reached, or did not admit the host again, for too long.
     const GAVE_UP: u8 = 4;
 
-    /// How the names of temporary directories begin; the host's number follows.
+    /// How the names of temporary directories begin; the host's id follows.
     const TEMPORARY_PREFIX: &str = "shoal-join-";
 
     /// How the work of a host has ended.
@@ -132,26 +132,27 @@ mod with_network {
 
     /// This host, as the run knows it, and how it reaches the run.
     struct JoiningHost {
-        number: u64,
+        id: u64,
         name: String,
         endpoint: Endpoint,
         /// `None` if the connection is not encrypted.
         key: Option<KeyFile>,
     }
 
-    /// Joins the run, and works for it until it is over. A host that has lost its actors, or that the run wants to have
-    /// another number of them, joins again.
-    pub(super) fn join(args: &JoinArgs, run: &str, mut actors: u32) -> anyhow::Result<ExitCode> {
+    /// Joins the run at `place`, an endpoint or a directory, and works for it until it is over. The host joins again if
+    /// it has lost its actors, if the run wants it to have another number of actors, or if the run listens at another
+    /// endpoint.
+    pub(super) fn join(args: &JoinArgs, place: &str, mut actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
-        let mut reached = endpoint_and_key(args, run)?;
+        let mut reached = endpoint_and_key(args, place, None)?;
         remove_abandoned(&std::env::temp_dir());
         let signals = Signals::register()?;
         let mut attempt = 1;
         loop {
-            match join_once(args, run, actors, reached.clone(), &signals, attempt)? {
+            match join_once(args, place, actors, reached.clone(), &signals, attempt)? {
                 HostEnd::Exit(code) => return Ok(code),
                 HostEnd::Moved => {
-                    reached = endpoint_and_key(args, run)?;
+                    reached = endpoint_and_key(args, place, reached.1.take())?;
                     say(format!("the run listens on {} now; joining again", reached.0));
                 }
                 HostEnd::JoinAgain(JoinAgain::LostActors) => {
@@ -169,21 +170,21 @@ mod with_network {
     /// Joins the run; `attempt` counts from 1.
     fn join_once(
         args: &JoinArgs,
-        run: &str,
+        place: &str,
         actors: u32,
         (endpoint, key): (Endpoint, Option<KeyFile>),
         signals: &Signals,
         attempt: u32,
     ) -> anyhow::Result<HostEnd> {
         let interrupt = signals.interrupt();
-        let number = host_number()?;
+        let id = draw_host_id()?;
         let name = match &args.name {
             Some(name) => name.clone(),
             None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
         };
         let hello = Hello {
             program: env!("CARGO_PKG_VERSION").into(),
-            host: number,
+            host: id,
             name: name.clone(),
             instructions: vector_instructions(),
             actors,
@@ -191,12 +192,12 @@ mod with_network {
             held: Vec::new(),
         };
         let reached = (&endpoint, key.as_ref());
-        let (lease, connection) = match ask_to_be_admitted(args, run, &hello, reached, &interrupt, attempt)? {
+        let (lease, connection) = match ask_to_be_admitted(args, place, &hello, reached, &interrupt, attempt)? {
             Answer::Admitted(lease, connection) => (lease, connection),
             Answer::Exit(code) => return Ok(HostEnd::Exit(code)),
             Answer::Moved => return Ok(HostEnd::Moved),
         };
-        let temporary = std::env::temp_dir().join(format!("{TEMPORARY_PREFIX}{number:016x}"));
+        let temporary = std::env::temp_dir().join(format!("{TEMPORARY_PREFIX}{id:016x}"));
         let path = match (&args.local, attempt) {
             (None, _) => temporary,
             (Some(local), 1) => local.clone(),
@@ -204,12 +205,12 @@ mod with_network {
         };
         let path = path.as_path();
         let host = JoiningHost {
-            number,
+            id,
             name,
             endpoint,
             key,
         };
-        let worked = work(args, run, host, (lease, connection), path, signals);
+        let worked = work(args, place, host, (lease, connection), path, signals);
         if args.local.is_none() {
             let log = RunDir::at(path).log();
             if worked.is_err() && log.exists() {
@@ -235,14 +236,14 @@ mod with_network {
     /// When the first attempt is refused, or the network fails.
     fn ask_to_be_admitted(
         args: &JoinArgs,
-        run: &str,
+        place: &str,
         hello: &Hello,
         (endpoint, key): (&Endpoint, Option<&KeyFile>),
         interrupt: &Interrupt,
         attempt: u32,
     ) -> anyhow::Result<Answer> {
         let joins_again = attempt > 1;
-        let ends = || interrupt.signal().is_some() || is_finished(run) || has_moved(run, endpoint);
+        let ends = || interrupt.signal().is_some() || is_finished(place) || has_moved(place, endpoint);
         // When a host joins again, the run may not have got its former actors back yet.
         let said = Cell::new(false);
         let ask_again = |why: &str| {
@@ -267,13 +268,13 @@ mod with_network {
             (_, Some(signal)) => Ok(Answer::Exit(exit_code(signal))),
             (Ok((Admission::RunIsEnding, _)), None) if joins_again => run_is_over(),
             (Ok((Admission::RunIsEnding, _)), None) => bail!("{endpoint} admits no host: the run is ending"),
-            (Ok((Admission::Refused(_), _)), None) if joins_again && is_finished(run) => run_is_over(),
+            (Ok((Admission::Refused(_), _)), None) if joins_again && is_finished(place) => run_is_over(),
             (Ok((Admission::Refused(why), _)), None) if joins_again => {
                 give_up(format!("{endpoint} does not admit this host again: {why}"))
             }
             (Ok((Admission::Refused(why), _)), None) => bail!("{endpoint} does not admit this host: {why}"),
-            (Err(JoinError::Silence { .. }), None) if is_finished(run) => run_is_over(),
-            (Err(JoinError::Silence { .. }), None) if has_moved(run, endpoint) => Ok(Answer::Moved),
+            (Err(JoinError::Silence { .. }), None) if is_finished(place) => run_is_over(),
+            (Err(JoinError::Silence { .. }), None) if has_moved(place, endpoint) => Ok(Answer::Moved),
             (Err(error @ JoinError::Silence { .. }), None) => give_up(error.to_string()),
             (Err(error), None) => Err(error.into()),
         }
@@ -300,16 +301,16 @@ mod with_network {
         signals: &Signals,
     ) -> anyhow::Result<HostEnd> {
         let JoiningHost {
-            number,
+            id,
             name,
             endpoint,
             key,
         } = host;
-        // The name of the run in its messages is that of its own configuration.
+        // The run's id, which names the run in its messages, is in its configuration.
         let run_id = joined_run_id(&lease.config)?;
         // The environment may take minutes to start, and it may not be usable here. If anything fails before the
         // relay runs, `keeper` is dropped, and that gives the actors back to the run.
-        let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
+        let keeper = LeaseKeeper::start(connection, run_id.clone(), id)?;
         let interrupt = signals.interrupt();
         if let Some(signal) = interrupt.signal() {
             return Ok(HostEnd::Exit(exit_code(signal)));
@@ -318,7 +319,7 @@ mod with_network {
         if let Some(key) = key {
             key.write(&run.path().join(KeyFile::JOIN))?;
         }
-        HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&run)?;
+        HostFile::new(endpoint.clone(), run_id, (id, name), &lease).write(&run)?;
         let has_heard = keeper.run_is_over();
         if has_heard() {
             say("the run is over");
@@ -347,7 +348,8 @@ mod with_network {
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {
                 say(format!(
-                    "error: {endpoint} could not be reached for {} s",
+                    "error: {endpoint} could not be reached, or did not admit this host again, for {} s; shoal.log \
+                     in the run's directory may tell why",
                     args.give_up.as_secs()
                 ));
                 GAVE_UP.into()
@@ -394,29 +396,34 @@ mod with_network {
     }
 
     /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.
-    fn is_finished(run: &str) -> bool {
-        let outcome = RunDir::open(Path::new(run)).map(|run| RunOutcome::read(&run));
+    fn is_finished(place: &str) -> bool {
+        let outcome = RunDir::open(Path::new(place)).map(|run| RunOutcome::read(&run));
         matches!(outcome, Ok(Ok(Some(outcome))) if outcome.state == RunState::Finished)
     }
 
     /// Whether this is the directory of a run that listens at another endpoint, as after a scheduler has moved it.
-    fn has_moved(run: &str, endpoint: &Endpoint) -> bool {
-        let directory = Path::new(run);
+    fn has_moved(place: &str, endpoint: &Endpoint) -> bool {
+        let directory = Path::new(place);
         directory.is_dir() && JoinFile::read(directory).is_ok_and(|file| file.endpoint != *endpoint)
     }
 
-    /// Where to connect to, and with which key.
-    fn endpoint_and_key(args: &JoinArgs, run: &str) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
-        let directory = Path::new(run);
+    /// Where to connect to, and with which key. `before` is the key that an earlier call returned, for a key from
+    /// standard input.
+    fn endpoint_and_key(
+        args: &JoinArgs,
+        place: &str,
+        before: Option<KeyFile>,
+    ) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
+        let directory = Path::new(place);
         let (endpoint, key) = if directory.is_dir() {
             let file = JoinFile::read(directory)
-                .with_context(|| format!("nobody can join {run}: was it started with --listen?"))?;
+                .with_context(|| format!("nobody can join {place}: was it started with --listen?"))?;
             (
                 file.endpoint,
                 args.key.clone().unwrap_or_else(|| directory.join(KeyFile::JOIN)),
             )
         } else {
-            let endpoint = run.parse::<Endpoint>();
+            let endpoint = place.parse::<Endpoint>();
             let endpoint = endpoint.map_err(|error| UsageError(error.to_string()))?;
             let key = match &args.key {
                 None if endpoint.is_encrypted() => {
@@ -427,7 +434,12 @@ mod with_network {
             };
             (endpoint, key)
         };
-        let key = endpoint.is_encrypted().then(|| KeyFile::read(&key)).transpose()?;
+        let read = || match before {
+            // Standard input can be read only once.
+            Some(before) if key == Path::new("-") => Ok(before),
+            _ => KeyFile::read(&key),
+        };
+        let key = endpoint.is_encrypted().then(read).transpose()?;
         Ok((endpoint, key))
     }
 
@@ -441,11 +453,32 @@ mod with_network {
     }
 
     /// A number that no other host draws.
-    fn host_number() -> anyhow::Result<u64> {
+    fn draw_host_id() -> anyhow::Result<u64> {
         let mut bytes = [0; 8];
         let mut file = std::fs::File::open("/dev/urandom").context("cannot draw a number")?;
         std::io::Read::read_exact(&mut file, &mut bytes).context("cannot draw a number")?;
         Ok(u64::from_le_bytes(bytes))
+    }
+
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+
+        #[test]
+        fn a_key_from_standard_input_is_read_once() {
+            let args = JoinArgs {
+                run: None,
+                key: Some("-".into()),
+                actors: None,
+                give_up: Duration::ZERO,
+                name: None,
+                local: None,
+                template: None,
+            };
+            let key = KeyFile::new("1a".into(), "A".into(), "C".into(), "secret".into());
+            let reached = endpoint_and_key(&args, "tls/127.0.0.1:7", Some(key.clone())).unwrap();
+            assert_eq!(reached.1, Some(key));
+        }
     }
 }
 

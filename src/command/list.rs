@@ -25,7 +25,7 @@ pub(crate) struct ListArgs {
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Printed<'a> {
+struct ListJson<'a> {
     directory: &'a Path,
     runs: &'a [ListedRun],
     suites: &'a [ListedSuite],
@@ -55,7 +55,7 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
     let suites = suites_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
     let mut stdout = std::io::stdout().lock();
     if args.json {
-        let printed = Printed {
+        let printed = ListJson {
             directory,
             runs: &runs,
             suites: &suites,

@@ -29,7 +29,7 @@ fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
     if new || !(is_there(&gate)? && is_there(&join)?) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALIDITY)?;
-        // If this process is killed in between, one of two keys that do not match must not be left.
+        // Removed first: if this process is killed in between, no pair of keys that do not match is left.
         remove_if_any(&join)?;
         keys.gate.write(&gate)?;
         keys.join.write(&join)?;
@@ -49,7 +49,7 @@ pub(crate) struct ListenArgs {
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = Endpoint::DEFAULT)]
     pub(crate) listen: Option<String>,
 
-    /// Make new keys (with `resume`). The old `join.key` opens nothing any more.
+    /// Make new keys (with `resume`). Hosts with the old `join.key` are refused.
     #[arg(long, requires = "listen")]
     pub(crate) new_keys: bool,
 
@@ -91,7 +91,7 @@ impl ListenArgs {
         let mut endpoint = endpoint.parse::<Endpoint>()?;
         let before = JoinFile::read(run.path()).ok();
         let timeout = before.as_ref().map_or(Duration::ZERO, |_| EARLIER_GATE_TIMEOUT);
-        // A resumed run listens where the hosts of before are trying to reach it.
+        // A resumed run listens where its earlier hosts try to reach it.
         if endpoint.to_string() == Endpoint::DEFAULT
             && let Some(before) = before
         {

@@ -38,7 +38,7 @@ const NOT_RUNNING: u8 = 3;
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Printed<'a> {
+struct StatusJson<'a> {
     running: bool,
     #[serde(flatten)]
     status: &'a RunStatus,
@@ -90,7 +90,7 @@ pub(super) fn show_saved(run: &Path, json: bool, client: &RunClient) -> anyhow::
     let mut stdout = std::io::stdout().lock();
     let here = run.display();
     if json {
-        let printed = Printed {
+        let printed = StatusJson {
             running: false,
             status: &status,
         };
@@ -109,7 +109,7 @@ pub(super) fn show_saved(run: &Path, json: bool, client: &RunClient) -> anyhow::
 
 fn show(args: &StatusArgs, status: &RunStatus, to: &mut impl Write) -> anyhow::Result<()> {
     if args.json {
-        let printed = Printed { running: true, status };
+        let printed = StatusJson { running: true, status };
         writeln!(to, "{}", serde_json::to_string(&printed)?)?;
     } else {
         writeln!(to, "{}", table(status))?;

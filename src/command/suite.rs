@@ -98,7 +98,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
             None => bail!("{here} exists already; choose another directory with --run, or remove it"),
         };
     }
-    // Before anything is made: is each of them a configuration?
+    // Before anything is created: every run must have a valid configuration.
     let name = configuration::check(&suite)?;
     let directory = match &overrides.run {
         Some(path) if path.exists() => RunDir::at(path),
@@ -119,8 +119,8 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     begin(directory.path(), options)
 }
 
-/// The number of files in this directory that a suite has left which was killed before it had written its own file; `None`
-/// if there is anything else.
+/// The number of temporary files in this directory, left by a process that was killed while it wrote `suite.json`;
+/// `None` if there is anything else.
 fn unfinished_files(directory: &Path) -> anyhow::Result<Option<usize>> {
     if !directory.is_dir() {
         return Ok(None);

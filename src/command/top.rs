@@ -155,7 +155,8 @@ fn read_keys(screen: &mut Screen, link: &LauncherLink) -> anyhow::Result<bool> {
     Ok(false)
 }
 
-/// The number of the signal that has arrived; 0 if none has. Ends the process if the main loop hangs after a signal.
+/// Starts a thread that watches for signals. Returns the number of the one that has arrived, 0 until then. The thread
+/// ends the process if the main loop hangs after a signal.
 fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     let signals = Signals::register()?;

@@ -44,7 +44,7 @@ pub(crate) struct OutputMode {
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Summary {
+struct TrainingJson {
     run: String,
     env_steps: u64,
     updates: u64,
@@ -138,7 +138,7 @@ fn train_and_report(
         run.check()?;
         finished.write(run)?;
     }
-    let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|first| &first.summary))?;
+    let summary = TrainingJson::new(&config, run, &outcome, evaluated.first().map(|first| &first.summary))?;
     if !output.quiet {
         let results = results(&config, run, &evaluated)?;
         // As in `say`.
@@ -189,7 +189,7 @@ fn name(policy: SavedPolicy) -> &'static str {
     }
 }
 
-impl Summary {
+impl TrainingJson {
     fn new(
         config: &Config,
         run: &RunDir,
@@ -256,7 +256,7 @@ fn write_summary(
     to: &mut impl Write,
     run: &RunDir,
     outcome: &TrainingOutcome,
-    summary: &Summary,
+    summary: &TrainingJson,
     results: &[(&str, String)],
 ) -> std::io::Result<()> {
     let mut table = Table::new();

@@ -46,13 +46,12 @@ pub(super) struct Child {
     pub(super) restarts: u32,
     pub(super) restart_at: Instant,
     started_at: Instant,
-    /// Failed starts since the last process that was able to work, and the time of the first of them.
-    failures: u32,
-    failing_since: Option<Instant>,
+    /// Failed starts since the last process that was able to work; `None` if there were none.
+    failures: Option<Failures>,
     /// The version of the policy in the process's first heartbeat. A learner begins with that of its checkpoint, an
     /// evaluator with that of its last evaluation.
     began_with: u64,
-    /// What the last process began with that was able to work, and then failed by itself.
+    /// `began_with` of the last process that was able to work and then failed by itself.
     failed_after: Option<u64>,
     /// The longest successful start: from the start until the process was ready.
     longest_good_start: Option<Duration>,
@@ -74,6 +73,14 @@ pub(super) struct Child {
     /// The time and the steps at which its rate was last computed.
     rate_computed_at: (Instant, u64),
     rate: f64,
+}
+
+/// Failed starts in a row.
+#[derive(Clone, Copy, Debug)]
+struct Failures {
+    count: u32,
+    /// When the first of them began.
+    since: Instant,
 }
 
 /// The launcher's reaction to the end of a process.
@@ -102,8 +109,7 @@ impl Child {
             restarts: 0,
             restart_at: now,
             started_at: now,
-            failures: 0,
-            failing_since: None,
+            failures: None,
             began_with: 0,
             failed_after: None,
             longest_good_start: None,
@@ -218,7 +224,7 @@ impl Child {
             if !was_killed && self.repeats_itself() {
                 return self.count_failure(self.started_at, give_up_after, now);
             }
-            (self.failures, self.failing_since) = (0, None);
+            self.failures = None;
             return RestartDecision::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
         }
         let blameless = match self.activity() {
@@ -234,8 +240,9 @@ impl Child {
         self.count_failure(self.started_at, give_up_after, now)
     }
 
-    /// Whether the process, which has failed by itself, began where the one that failed before it had begun: nothing has
-    /// been saved since, so the next one would repeat its work. Only learner and evaluator continue from what was saved.
+    /// Whether nothing was saved between the previous failure and this one, so that the next process would repeat the
+    /// same work: both processes began with the same policy version. Only learner and evaluator continue from saved
+    /// state.
     fn repeats_itself(&mut self) -> bool {
         matches!(self.instance.role, Role::Learner | Role::Evaluator)
             && self.failed_after.replace(self.began_with) == Some(self.began_with)
@@ -249,15 +256,16 @@ impl Child {
 
     /// Counts a failure of a start that began at `begun`.
     fn count_failure(&mut self, begun: Instant, give_up_after: Duration, now: Instant) -> RestartDecision {
-        self.failures += 1;
-        let since = *self.failing_since.get_or_insert(begun);
+        let failures = self.failures.get_or_insert(Failures { count: 0, since: begun });
+        failures.count += 1;
+        let Failures { count, since } = *failures;
         let longest = self
             .longest_failed_start
             .max(self.longest_good_start.unwrap_or_default());
-        if self.failures >= MAX_FAILURES && now - since >= give_up_after.max(2 * longest) {
-            return RestartDecision::GiveUp(self.failures);
+        if count >= MAX_FAILURES && now - since >= give_up_after.max(2 * longest) {
+            return RestartDecision::GiveUp(count);
         }
-        let doubled = FIRST_PAUSE * 2_u32.pow((self.failures - 1).min(10));
+        let doubled = FIRST_PAUSE * 2_u32.pow((count - 1).min(10));
         RestartDecision::Restart(doubled.min(LONGEST_PAUSE))
     }
 

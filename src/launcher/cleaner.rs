@@ -49,7 +49,7 @@ fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
     Ok(child.wait(TIMEOUT))
 }
 
-/// The work of the child process of the launcher with this process id.
+/// The clean-up itself, in the child process. `launcher` is the process id of its parent.
 ///
 /// # Errors
 /// When the launcher has died, or files cannot be listed or removed.

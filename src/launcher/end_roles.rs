@@ -45,15 +45,15 @@ pub(super) trait EndRoles {
     /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
     fn sleep(&mut self, most: Duration);
 
-    /// Waits until processes have ended that were asked to, and kills them after `timeout`.
+    /// Waits until the processes that were asked to end have ended. Kills them after `timeout`.
     fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, timeout: Duration, receiver: Option<Role>) {
         if !self.have_ended_within(timeout, which, receiver) {
-            self.parts().0.kill(which);
+            self.parts().0.kill(which, "did not end when asked to");
         }
     }
 
-    /// Waits at most `timeout` until processes have ended that were asked to. If the `receiver` of what they send dies
-    /// meanwhile, it is started again, once. Returns whether they have ended.
+    /// Waits at most `timeout` until the processes that were asked to end have ended. If the `receiver` of what they
+    /// send dies meanwhile, it is started again, once. Returns whether they have ended.
     fn have_ended_within(
         &mut self,
         timeout: Duration,
@@ -69,7 +69,7 @@ pub(super) trait EndRoles {
             if Instant::now() >= deadline {
                 return false;
             }
-            // If it cannot be started, the run must end all the same.
+            // Once restarted, or if that fails, the receiver is left alone: the run must end in any case.
             receiver = receiver.filter(|role| matches!(supervisor.restart_if_dead(*role, domain), Ok(false)));
             // An error here must not prevent the end.
             let _ = self.answer_requests();

@@ -11,8 +11,8 @@ use shoal_common::run_dir::RunDir;
 
 use super::log::Log;
 
-/// More incarnations than are used between two committed chunks, those of other hosts included. If the counter is lost,
-/// this many are skipped.
+/// How many incarnations are skipped if the counter is lost: more than are used between two committed chunks, those of
+/// other hosts included.
 const STARTS_WITHOUT_CHUNK: u64 = 64 * HostLease::INCARNATIONS;
 
 /// Counts the processes that the run has started, in a file that lasts over resumes.

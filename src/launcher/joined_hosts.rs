@@ -65,13 +65,13 @@ impl JoinedHosts {
     }
 
     /// Changes the wanted actors of all hosts, in the order of [`actor_hosts`](Self::actor_hosts).
-    pub(super) fn want(&mut self, actors: &[u32]) {
+    pub(super) fn set_wanted_actors(&mut self, actors: &[u32]) {
         for (admitted, wanted) in self.admitted.iter_mut().zip(actors) {
             admitted.lease.wanted_actors = *wanted;
         }
     }
 
-    /// Actors that hosts are about to have more than they have. They are free now, and kept for these hosts.
+    /// The number of free actors that are kept for joined hosts which are about to have more actors than they have.
     pub(super) fn reserved(&self) -> usize {
         let more = |lease: &HostLease| (lease.wanted_actors as usize).saturating_sub(lease.actors.len());
         self.admitted.iter().map(|admitted| more(&admitted.lease)).sum()

@@ -31,7 +31,7 @@ const ACTORS_HAND_OVER_TIMEOUT: Duration = Duration::from_secs(6);
 pub(crate) enum JoinEnd {
     /// The run is over.
     Over,
-    /// The run could not be reached for too long.
+    /// The run could not be reached, or did not admit this host again, for too long.
     GaveUp,
     /// The host must join again.
     JoinAgain(JoinAgain),
@@ -49,11 +49,11 @@ pub(crate) struct JoinEvents<'a> {
     pub(crate) on_relay_ready: Box<dyn FnOnce() + 'a>,
     /// Asked whether the run is over while the relay has no connection.
     pub(crate) run_is_over: Box<dyn Fn() -> bool + 'a>,
-    /// Asked then whether the run listens at another endpoint.
+    /// Asked whether the run listens at another endpoint, while the relay has no connection.
     pub(crate) run_has_moved: Box<dyn Fn() -> bool + 'a>,
 }
 
-/// Works for the run until one of these endings. `config` and `run` are those of this host.
+/// Works for the run, and returns how that ended. `config` and `run` are those of this host.
 pub(crate) fn run(
     config: Config,
     run: &LockedRun,
@@ -187,7 +187,9 @@ impl<'a> JoinedLauncher<'a> {
                 RunCondition::AtWork => {}
                 RunCondition::SharedMemoryOccupied | RunCondition::FilesRemoved if self.end_request.is_some() => {}
                 RunCondition::LearnerDone => bail!("a learner has ended on a host that has none"),
-                RunCondition::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
+                RunCondition::SharedMemoryOccupied => {
+                    bail!("dead processes occupy shared memory permanently: join again")
+                }
                 RunCondition::FilesRemoved => bail!(
                     "another program has removed files of this host in {}: join again",
                     self.domain.directory()?.display()

@@ -1,5 +1,5 @@
-//! Which actors the learner's host has, in a file of the run. Without it, the next launcher takes the first actors: a
-//! joined host may have some of those, with chunks that are not committed yet.
+//! Which actors the learner's host has, in a file of the run. Without the file, the next launcher would take the first
+//! indices. Some of those may belong to a joined host, with chunks that are not committed yet.
 
 use std::collections::BTreeSet;
 
@@ -18,8 +18,8 @@ impl VersionedFile for LocalActors {
     const IF_DAMAGED: &'static str = "; remove it, and the run continues with its first actors";
 }
 
-/// The `count` actors that this host begins with, each below `limit`, in ascending order: those that an earlier launcher
-/// has stored, and then the first others.
+/// The `count` actors that this host begins with, each below `limit`, in ascending order. Those that an earlier
+/// launcher stored come first; the lowest other indices fill the rest.
 ///
 /// # Errors
 /// When the file cannot be read.

@@ -42,8 +42,8 @@ pub(super) struct Log(Arc<Mutex<Inner>>);
 struct Inner {
     file: File,
     last: HashMap<String, VecDeque<KeptLine>>,
-    /// Bytes that other programs may still write.
-    program_bytes_left: u64,
+    /// Bytes that other programs may still write; `None` once the log has said that it takes no more.
+    program_bytes_left: Option<u64>,
 }
 
 /// A line that a process has written.
@@ -65,7 +65,7 @@ impl Log {
         Ok(Self(Arc::new(Mutex::new(Inner {
             file,
             last: HashMap::new(),
-            program_bytes_left: MAX_LOG_BYTES.saturating_sub(length).max(MIN_PROGRAM_BYTES),
+            program_bytes_left: Some(MAX_LOG_BYTES.saturating_sub(length).max(MIN_PROGRAM_BYTES)),
         }))))
     }
 
@@ -87,7 +87,7 @@ impl Log {
             }
             Line::TooMuch(text) => inner.remember(who, text, false),
             // The log already says that it takes no more lines of programs.
-            Line::LeftOut(_) if inner.program_bytes_left == 0 => {}
+            Line::LeftOut(_) if inner.program_bytes_left.is_none() => {}
             Line::LeftOut(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
         }
     }
@@ -118,14 +118,15 @@ impl Log {
 impl Inner {
     /// Whether the log has room for this line of another program. Logs once that it has none.
     fn takes(&mut self, line: &str) -> bool {
-        let length = line.len() as u64 + 1;
-        if self.program_bytes_left > 0 && self.program_bytes_left < length {
+        let Some(left) = self.program_bytes_left else {
+            return false;
+        };
+        self.program_bytes_left = left.checked_sub(line.len() as u64 + 1);
+        if self.program_bytes_left.is_none() {
             let what = "this log takes no more of what other programs write to standard error (SHOAL_LOG=debug logs everything)";
             self.write("launcher", what);
-            self.program_bytes_left = 0;
         }
-        self.program_bytes_left = self.program_bytes_left.saturating_sub(length);
-        self.program_bytes_left > 0
+        self.program_bytes_left.is_some()
     }
 
     fn remember(&mut self, who: &str, text: &str, is_in_log: bool) {
@@ -219,5 +220,21 @@ mod tests {
         let (log, text) = log_in(directory.path());
         log.line("env-server-0", Line::Kept("again"), OutputSource::Program);
         assert!(text().contains("again"));
+    }
+
+    #[test]
+    fn a_line_that_fills_the_log_exactly_is_logged_and_the_next_one_is_announced_as_left_out() {
+        let directory = tempfile::tempdir().unwrap();
+        let (log, text) = log_in(directory.path());
+        let line = "x".repeat(1024 * 1024 - 1);
+        let program_line = |line: &str| log.line("env-server-0", Line::Kept(line), OutputSource::Program);
+        (0..16).for_each(|_| program_line(&line));
+        assert_eq!(text().matches(&line).count(), 16);
+        assert!(!text().contains("this log takes no more"));
+        program_line("one more");
+        program_line("");
+        assert!(!text().contains("one more"));
+        assert_eq!(text().matches("this log takes no more").count(), 1);
+        assert_eq!(text().lines().count(), 17);
     }
 }

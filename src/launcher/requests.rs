@@ -45,7 +45,7 @@ pub(super) fn status(
     Ok(status)
 }
 
-/// Changes the numbers of actors `now`; that of this host also for when the run is resumed.
+/// Changes the numbers of actors. That of this host is also stored for `resume`, with the moment `now`.
 pub(super) fn scale(
     config: &mut Config,
     run: &RunDir,

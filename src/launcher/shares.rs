@@ -60,13 +60,9 @@ pub(super) fn shares(request: &ScaleRequest, hosts: &[ActorHost], max_actors: u3
             "this run can have 1 to {most} actors (actors.max, fixed when it was created)"
         ));
     }
-    if shares.contains(&0) {
-        return Err("a host has at least 1 actor; to free it altogether, end its `shoal join`".into());
-    }
-    let most = ActorsConfig::MAX_ON_A_HOST;
-    if shares.iter().any(|share| *share > most) {
-        return Err(format!("a host has at most {most} actors"));
-    }
+    shares
+        .iter()
+        .try_for_each(|share| ActorsConfig::check_on_a_host(*share))?;
     let sum: u64 = shares.iter().map(|share| u64::from(*share)).sum();
     if sum <= u64::from(max_actors) {
         return Ok(shares);
@@ -97,7 +93,7 @@ fn share_total(total: u32, named: &[Option<u32>], hosts: &[ActorHost]) -> Result
         ));
     };
     let mut shares: Vec<u32> = named.iter().map(|named| named.unwrap_or(1)).collect();
-    // One after the other goes to the host with the most cores for each actor that it would have (D'Hondt).
+    // Each further actor goes to the host with the most cores per actor, this actor counted (D'Hondt).
     for _ in 0..rest - open {
         let per_actor = |i: &usize| f64::from(hosts[*i].cores.max(1)) / f64::from(shares[*i] + 1);
         let next = (0..hosts.len())

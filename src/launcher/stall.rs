@@ -53,7 +53,7 @@ impl StallDetector {
             return Vec::new();
         }
         let mut found: Vec<_> = (0..children.len())
-            .filter_map(|i| Some((i, self.fault(children, i)?)))
+            .filter_map(|i| Some((i, self.reason_to_replace(children, i)?)))
             .filter(|(i, _)| !children[*i].is_stopped())
             .collect();
         if found.is_empty() && self.sees_whole_run {
@@ -83,7 +83,7 @@ impl StallDetector {
     }
 
     /// Why one child must be replaced, by its own state and that of its environment server or client.
-    fn fault(&self, children: &[Child], i: usize) -> Option<&'static str> {
+    fn reason_to_replace(&self, children: &[Child], i: usize) -> Option<&'static str> {
         let child = &children[i];
         if !child.is_active() {
             return None;

@@ -82,7 +82,7 @@ pub(super) struct Supervisor {
     actors: Vec<u32>,
     /// How many further actors this host gets as soon as other hosts have released them.
     actors_to_take: usize,
-    /// Since when the system refuses what wanted actors need.
+    /// Set while the system refuses what wanted actors need.
     refused_actors: Option<RefusedActors>,
     /// The most actors that the run may have on all hosts.
     max_actors: u32,
@@ -97,7 +97,7 @@ pub(super) struct Supervisor {
     run: PathBuf,
     /// Which directory was at that path.
     directory: RunDirId,
-    /// Whether the output of environment servers is Shoal's own or another program's. With `SHOAL_LOG=debug` all of it
+    /// Whose output the environment servers write. With `SHOAL_LOG=debug` it counts as Shoal's own, so that all of it
     /// is logged.
     server_output: OutputSource,
     /// How long an environment's own program may take to start.
@@ -248,9 +248,9 @@ impl Supervisor {
                 self.log.note(&name, &format!("{error:#}; trying again in {pause:?}"));
                 Ok(())
             }
-            RestartDecision::GiveUp(starts) => {
+            RestartDecision::GiveUp(failures) => {
                 self.note_incident(i, IncidentKind::GivenUp, String::new());
-                Err(error.context(format!("{name} is given up after {starts} attempts")))
+                Err(error.context(format!("{name} is given up after {failures} failures")))
             }
         }
     }
@@ -274,7 +274,7 @@ impl Supervisor {
         let Some(i) = self.children.iter().position(is_dead) else {
             return Ok(false);
         };
-        // Without its files, the clean-up and the successor would find those of another run, or none.
+        // If files of the run are missing, the clean-up and the new process would find those of another run, or none.
         if role == Role::Learner && self.learner_done || !domain.is_intact(self.services.count()) {
             return Ok(false);
         }
@@ -291,7 +291,7 @@ impl Supervisor {
         if role == Role::Learner {
             self.unsaved_learner = None;
         }
-        self.note_incident(i, IncidentKind::StartedAgain, String::new());
+        self.note_incident(i, IncidentKind::Restarted, String::new());
         Ok(true)
     }
 
@@ -382,7 +382,8 @@ impl Supervisor {
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
         let ended = self.children.iter().any(|child| child.ended.is_some());
-        // Before anything is cleaned up or started: both would find the files of another run, or none.
+        // Checked before anything is cleaned up or started: without the run's files, both would find those of another
+        // run, or none.
         if (ended || self.cleaning.is_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
         {
             return Ok(RunCondition::FilesRemoved);
@@ -427,11 +428,11 @@ impl Supervisor {
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
         if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
-            // One that has retired and is wanted again did not fail.
+            // A process that retired and is wanted again did not fail: this start is no restart.
             let restarts = child.restarts + u32::from(!child.is_retiring);
             if self.start(i)? {
                 self.children[i].restarts = restarts;
-                self.note_incident(i, IncidentKind::StartedAgain, String::new());
+                self.note_incident(i, IncidentKind::Restarted, String::new());
             }
         }
         Ok(false)
@@ -460,13 +461,18 @@ impl Supervisor {
         match decision {
             RestartDecision::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
+                let when = if pause.is_zero() {
+                    "at once".to_owned()
+                } else {
+                    format!("in {pause:?}")
+                };
                 self.log
-                    .note(&name, &format!("{}; restarting it in {pause:?}", describe_exit(status)));
+                    .note(&name, &format!("{}; restarting it {when}", describe_exit(status)));
                 Ok(false)
             }
-            RestartDecision::GiveUp(starts) => {
+            RestartDecision::GiveUp(failures) => {
                 self.note_incident(i, IncidentKind::GivenUp, String::new());
-                Err(self.give_up_error(&name, starts, status))
+                Err(self.give_up_error(&name, failures, status))
             }
         }
     }
@@ -536,7 +542,7 @@ impl Supervisor {
 
     /// Why the run ends, in one line: the role, what happened, its last message, and what to do. The log has its earlier
     /// messages.
-    fn give_up_error(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Error {
+    fn give_up_error(&self, name: &str, failures: u32, status: ExitStatus) -> anyhow::Error {
         let lines = self.log.last_lines(name);
         let message = match lines.last() {
             None if status.signal().is_some() => "it wrote no message; is memory short?",
@@ -544,7 +550,7 @@ impl Supervisor {
             Some(last) => last.strip_prefix("error: ").unwrap_or(last),
         };
         anyhow!(
-            "{name} failed {starts} times and is given up ({}): {message}; see shoal.log in the run's directory, fix \
+            "{name} failed {failures} times and is given up ({}): {message}; see shoal.log in the run's directory, fix \
              the cause, then `shoal resume {}` continues the run",
             describe_exit(status),
             self.run.display()

@@ -41,6 +41,18 @@ impl ActorsConfig {
         self.max.min(Self::MAX_ON_A_HOST)
     }
 
+    /// Checks a host's number of actors.
+    ///
+    /// # Errors
+    /// Why a host cannot have this number.
+    pub fn check_on_a_host(actors: u32) -> Result<(), String> {
+        match actors {
+            0 => Err("a host has at least 1 actor; to free it altogether, end its `shoal join`".into()),
+            1..=Self::MAX_ON_A_HOST => Ok(()),
+            _ => Err(format!("a host has at most {} actors", Self::MAX_ON_A_HOST)),
+        }
+    }
+
     /// Checks every number.
     ///
     /// # Errors

@@ -22,8 +22,9 @@ pub(super) struct Host {
     pub(super) acknowledgement_due: bool,
     /// When it was last heard of, or admitted.
     pub(super) heard_at: Instant,
-    /// Whether this gate has heard of it. An earlier gate, or nobody, may have admitted it.
-    pub(super) is_known: bool,
+    /// Whether it has asked this gate to be admitted, or has reported to it. The launcher also names hosts that only an
+    /// earlier gate knew.
+    pub(super) has_contacted: bool,
     /// The number of its last report.
     pub(super) last_report: ReportNumber,
     pub(super) has_left: bool,
@@ -41,8 +42,8 @@ pub(super) struct Host {
 }
 
 impl Host {
-    /// Whether it may be the reason why a lockstep run makes no progress: it is cut off, or not each of its actors and
-    /// environment servers waits.
+    /// Whether it may be the reason why a lockstep run makes no progress: it is cut off, or some of its actors and
+    /// environment servers do not wait.
     pub(super) fn is_awaited(&self) -> bool {
         let roles = self.newest_report.iter().flat_map(|report| &report.roles);
         let waiting = roles.filter(|role| role.activity != Activity::Working).count();
@@ -58,7 +59,7 @@ impl Host {
         }
         self.rows_at_last_status = (Instant::now(), self.forwarded_rows);
         let silent = self.heard_at.elapsed();
-        let cut_off = !self.is_known || silent >= CUT_OFF_AFTER;
+        let cut_off = !self.has_contacted || silent >= CUT_OFF_AFTER;
         let mut roles = Vec::new();
         for role in self.newest_report.iter().flat_map(|report| &report.roles) {
             let key = (role.role, role.index);

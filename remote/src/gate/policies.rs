@@ -66,7 +66,8 @@ impl Policies {
         };
         self.version = newest.header().version;
         let id = id_of(&newest);
-        // Who has waited longest comes first. Otherwise a host that asks again at once could keep the others waiting.
+        // The host that has waited longest comes first. Otherwise a host that asks again at once could keep the others
+        // waiting.
         let waiting = hosts.values_mut().filter_map(|host| {
             let (_, have, since) = host.policy_query.as_ref()?;
             (id != *have).then_some((*since, host))

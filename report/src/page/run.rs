@@ -314,7 +314,7 @@ impl Incidents {
     fn of(mut rows: Vec<IncidentRow>) -> Self {
         use shoal_run::records::recorder::IncidentKind;
         let count = |what| rows.iter().filter(|row| row.what == what).count();
-        let (restarts, kills) = (count(IncidentKind::StartedAgain), count(IncidentKind::Killed));
+        let (restarts, kills) = (count(IncidentKind::Restarted), count(IncidentKind::Killed));
         let more = rows.len().saturating_sub(INCIDENTS);
         rows.truncate(INCIDENTS);
         Self {

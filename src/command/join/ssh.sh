@@ -3,7 +3,8 @@
 #
 #   shoal train pendulum --run runs/ssh --listen
 #
-# Shoal must be installed on each of them. The key goes through ssh and is not kept there. This ends when the run is over.
+# Shoal must be installed on each of them. The key goes through ssh and is not kept there. The script ends when
+# the run is over.
 set -euo pipefail
 
 run=${RUN:-runs/ssh}

@@ -14,10 +14,10 @@ use crate::launcher::local_actors;
 use crate::launcher::process::name;
 use crate::launcher::shares::ActorHost;
 
-/// The pause before it is tried again to create what further actors need.
+/// The pause before the next attempt to create what further actors need.
 const REFUSED_ACTORS_PAUSE: Duration = Duration::from_secs(1);
 
-/// The system refuses what wanted actors need.
+/// Since when the system has refused what wanted actors need, and when to try again.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RefusedActors {
     since: Instant,
@@ -39,7 +39,7 @@ impl Supervisor {
         self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, what));
         self.actors.truncate(*here as usize);
         self.actors_to_take = *here as usize - self.actors.len();
-        self.joined_hosts.want(joined);
+        self.joined_hosts.set_wanted_actors(joined);
         self.take_free_actors();
         self.store_actors();
     }
@@ -69,7 +69,7 @@ impl Supervisor {
             && is_there()
             && let Err(error) = local_actors::write(&run, &self.actors)
         {
-            // The run goes on. Only a next launcher may give hosts other actors.
+            // The run goes on. The only effect is that the next launcher may give the hosts other actors.
             self.log.note("launcher", &format!("{error:#}"));
         }
     }

@@ -26,6 +26,9 @@ impl Supervisor {
         if let Some(lease) = self.joined_hosts.lease(host) {
             return Ok(ControlResponse::Admitted(lease.clone()));
         }
+        if let Err(why) = ActorsConfig::check_on_a_host(requested) {
+            return Ok(ControlResponse::Refused(why));
+        }
         let free: Vec<u32> = match self.lockstep_actors {
             // Processes for these actors end here; those of the other host continue from the same snapshots.
             Some(_) => self.actors.iter().rev().copied().collect(),
@@ -33,22 +36,13 @@ impl Supervisor {
             None => {
                 let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
                 let mut free: Vec<u32> = self.free_actors().filter(|index| !exists(*index)).collect();
-                // First those that this host cannot have.
+                // Actors that this host cannot have come first.
                 free.sort_by_key(|index| (*index < self.max_actors_here, *index));
                 let kept = self.actors_to_take + self.joined_hosts.reserved();
                 free.truncate(free.len().saturating_sub(kept));
                 free
             }
         };
-        if requested > ActorsConfig::MAX_ON_A_HOST {
-            let most = ActorsConfig::MAX_ON_A_HOST;
-            return Ok(ControlResponse::Refused(format!(
-                "a host may have {most} actors at most"
-            )));
-        }
-        if requested == 0 {
-            return Ok(ControlResponse::Refused("a host has at least one actor".into()));
-        }
         let requested = requested as usize;
         let distinct: HashSet<u32> = held.iter().copied().collect();
         let can_keep = held.len() == requested && distinct.len() == requested;

@@ -14,10 +14,10 @@ const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 /// to disappear.
 const OCCUPIED_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// How long they may do so while the clean-ups fail.
+/// How long dead processes may occupy shared memory while the clean-ups themselves fail.
 const FAILING_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// How soon a clean-up is repeated while they do.
+/// The pause between clean-ups while dead processes occupy shared memory.
 const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The clean-ups of a run's shared memory.

@@ -61,17 +61,16 @@ impl Supervisor {
         ended.is_some_and(|status| !status.success())
     }
 
-    /// Kills the processes of some roles that did not end when they were asked to.
-    pub(crate) fn kill(&mut self, which: impl Fn(Role) -> bool) {
+    /// Kills the processes of some roles. `why` says what they did, as in "did not end when asked to".
+    pub(crate) fn kill(&mut self, which: impl Fn(Role) -> bool, why: &str) {
         for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             if child.process.take().is_some() {
                 let name = name(child.instance);
-                self.log.note(&name, "did not end when asked to, and was killed");
-                let detail = "did not end when asked to".into();
+                self.log.note(&name, &format!("{why}, and was killed"));
                 self.incidents
-                    .push(Incident::of(child.instance, IncidentKind::Killed, detail));
+                    .push(Incident::of(child.instance, IncidentKind::Killed, why.into()));
                 if child.instance.role == Role::Learner {
-                    self.unsaved_learner = Some("it did not end when asked to, and was killed".into());
+                    self.unsaved_learner = Some(format!("it {why}, and was killed"));
                 }
             }
         }

@@ -16,8 +16,9 @@ pub enum IncidentKind {
     Stalled,
     /// An environment of it returned something invalid; its episodes were given up.
     Fault,
-    /// The role's process was started again.
-    StartedAgain,
+    /// The role's process was restarted.
+    #[serde(rename = "started-again")]
+    Restarted,
     /// The role failed too often and is not started again.
     GivenUp,
     /// The actor was no longer needed and has handed over its transitions, or its environment server ended.
