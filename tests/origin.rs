@@ -457,4 +457,7 @@ fn a_dataset_that_does_not_fit_is_refused_and_leaves_no_run() {
     std::fs::write(place.path().join("bin/python3"), "#!/bin/sh\nexit 1\n").unwrap();
     let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
     assert!(message.contains("python3 has no package shoal"), "{message}");
+    let mut without_python = place.shoal(&[&["train", "pendulum", "--run", "new"], &HAND[..]].concat());
+    let message = error_line(&without_python.env("PATH", place.path()).output().unwrap());
+    assert!(message.contains("cannot start python3: install Python"), "{message}");
 }

@@ -175,7 +175,7 @@ fn the_default_run_fits_into_a_container_and_one_with_64_actors_is_refused() {
     );
     let message = error_line(&refused);
     assert!(
-        message.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: allow at most "),
+        message.contains("MiB of /dev/shm for up to 64 actors, but only 64.0 MiB are free: allow at most "),
         "{message}"
     );
     assert!(!place.path().join("large").exists(), "nothing was created");

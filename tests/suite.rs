@@ -6,10 +6,12 @@ mod support;
 
 use std::path::Path;
 use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use shoal_common::channel::Domain;
+use shoal_run::suite::Suite;
 use support::{QUICK, Workplace, error_line, json, parse, until};
 
 /// Trains the suite `suite` of the pendulum and returns what it printed and said.
@@ -82,8 +84,18 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
     ended["reason"] = "the final evaluation was ended by signal 2 (SIGINT)".into();
     std::fs::write(first.join("outcome.json"), ended.to_string()).unwrap();
     std::fs::remove_file(first.join("final-evaluation.json")).unwrap();
+    // The run is evaluated, although nothing can be recorded for TensorBoard.
+    let (records, kept) = (first.join("tensorboard"), first.join("kept"));
+    std::fs::rename(&records, &kept).unwrap();
+    std::fs::write(&records, "").unwrap();
     let (again, said) = train(&place, &arguments);
+    std::fs::remove_file(&records).unwrap();
+    std::fs::rename(&kept, &records).unwrap();
     assert!(again == printed && said.contains("1 of 4 runs to train"), "{said}");
+    assert!(
+        said.contains("the final evaluation is not in TensorBoard's records"),
+        "{said}"
+    );
     assert_eq!(outcome()["reason"], Value::Null);
 
     // The same command has nothing left to do; another one is refused.
@@ -391,6 +403,28 @@ fn a_suite_is_changed_and_continued() {
         again["runs"][0]["env_steps"] == 300 && said.contains("0 of 4 runs to train"),
         "{said}"
     );
+}
+
+#[test]
+fn a_suite_that_waits_for_an_environment_is_interrupted() {
+    let place = Workplace::new();
+    let started = place.path().join("started");
+    // This server never describes itself.
+    let server = format!(
+        r#"environment.server=["sh","-c","touch '{}'; exec sleep 1000"]"#,
+        started.display()
+    );
+    let suite = Suite::new("gym:Pendulum-v1".into(), vec!["--set".into(), server], &[], &[1, 2]).unwrap();
+    let directory = place.path().join("suite");
+    std::fs::create_dir(&directory).unwrap();
+    suite.write(&directory).unwrap();
+    let mut resumed = start(&place, &["resume", "suite", "--quiet"]);
+    until("the server is started", || started.exists());
+    let asked = Instant::now();
+    kill_process(Pid::from_child(&resumed), Signal::INT).unwrap();
+    assert_eq!(resumed.wait().unwrap().code(), Some(130));
+    // By default, a server may take 120 s to start.
+    assert!(asked.elapsed() < Duration::from_secs(60));
 }
 
 #[test]

@@ -15,7 +15,7 @@ use shoal_common::role::Role;
 use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::registry;
-use shoal_learner::networks::initialise::initialise;
+use shoal_learner::networks::initialise::small_output;
 use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::child_process::ChildProcess;
@@ -62,7 +62,7 @@ impl Inference {
         let network = ddpg(config)?.networks(&config.spec).actor;
         let policy = DeterministicPolicy::new(network, range, ENVIRONMENTS);
         Ok(Self {
-            parameters: initialise(policy.layout(), config.run.seed, 0),
+            parameters: small_output(policy.layout(), config.run.seed, 0),
             observations: Rows::new(config)?.observations().to_vec(),
             policy,
             actions,

@@ -9,7 +9,7 @@ use shoal_actor::exploration::{Exploration, StepCounts};
 use shoal_common::network::{Network, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::stream::{Purpose, stream};
-use shoal_learner::networks::initialise::initialise;
+use shoal_learner::networks::initialise::small_output;
 use shoal_learner::networks::product::{Product, Transposed};
 
 use super::intervals::{self, Samples};
@@ -67,7 +67,7 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
     let config = temporary.remove_directory()?;
     let (width, action_width) = (config.spec.observation.width(), config.spec.action.width());
     let layout = network_of(config.policy_layout()?)?;
-    let parameters = initialise(&layout, config.run.seed, 0);
+    let parameters = small_output(&layout, config.run.seed, 0);
     let rows = Rows::new(&config)?;
     let mut actions = vec![0.0; ENVIRONMENTS * action_width];
     let mut policy = config.policy(ENVIRONMENTS)?;

@@ -27,7 +27,7 @@ const FIGURES_TIMEOUT: Duration = Duration::from_secs(60);
 /// Pause before the launcher is asked again in new shared memory.
 const ASK_AGAIN_PAUSE: Duration = Duration::from_millis(50);
 
-/// A run, whose launcher is asked if it has one.
+/// A run. Requests go to its launcher, if it has one.
 #[derive(Debug)]
 pub struct RunClient {
     /// The run's directory.
@@ -106,7 +106,8 @@ impl RunClient {
     /// Why a launcher that has processes in shared memory cannot be asked there.
     fn files_removed(&self, domain: &Domain) -> anyhow::Result<String> {
         Ok(format!(
-            "another program has removed files of {} in {}; its launcher repairs that within seconds, unless it is stopped",
+            "another program has removed files of {} in {}; the run's launcher makes them again within seconds, unless \
+             it is suspended: try again",
             self.run.path().display(),
             domain.directory()?.display()
         ))
@@ -119,8 +120,8 @@ impl RunClient {
         Ok(reason.filter(|reason| matches!(reason, OutcomeReason::Starting | OutcomeReason::FinalEvaluation)))
     }
 
-    /// The status, by the run's files, of a run whose launcher has no roles yet, or none any more. `None` if the
-    /// launcher has roles and should have answered.
+    /// The status of a run whose launcher has no roles yet, or no longer has any, read from the run's files. `None` if
+    /// the launcher has roles and should have answered.
     fn without_roles(&self, error: &ControlError) -> anyhow::Result<Option<RunStatus>> {
         let waiting = match self.reason_for_no_roles()? {
             Some(reason) => reason.to_string(),
@@ -178,7 +179,8 @@ impl RunClient {
         let asked = Instant::now();
         while self.run.is_running()? {
             if asked.elapsed() >= FIGURES_TIMEOUT {
-                bail!("{} was told to stop but is still running", self.run.path().display());
+                let here = self.run.path().display();
+                bail!("{here} was told to stop and is still running; `shoal status {here}` shows what it waits for");
             }
             std::thread::sleep(Duration::from_millis(10));
         }

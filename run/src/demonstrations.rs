@@ -50,7 +50,7 @@ struct Header {
 pub(crate) struct Demonstrations {
     header: Header,
     layout: RowLayout,
-    /// Its rows, in which `discount` is still 1 where the episode was terminated and 0 elsewhere.
+    /// Its rows. In place of the discount they have 1 if the step terminated the episode, otherwise 0.
     numbers: Vec<f32>,
 }
 
@@ -85,7 +85,9 @@ impl Demonstrations {
         let body = unseal(KIND, file).map_err(|error| anyhow::anyhow!("its output {error}"))?;
         let (length, rest) = body.split_first_chunk::<LENGTH>().context("its output has no header")?;
         let length = usize::try_from(u64::from_le_bytes(*length))?;
-        let (header, rows) = rest.split_at_checked(length).context("its output has half a header")?;
+        let (header, rows) = rest
+            .split_at_checked(length)
+            .context("its output ends within the header")?;
         let header: Header = toml::from_str(str::from_utf8(header)?).context("its header is damaged")?;
         let layout = RowLayout::new(header.observation.width(), header.action.width());
         let (numbers, remainder) = rows.as_chunks();
@@ -129,7 +131,7 @@ impl Demonstrations {
         Ok(*rows)
     }
 
-    /// What no actor of a run would have sent.
+    /// What is wrong with a row; `None` if an actor could have sent it.
     fn fault(&self, row: &Transition<'_>) -> Option<String> {
         for (what, space, numbers) in [
             ("the observation", &self.header.observation, row.s),

@@ -19,7 +19,7 @@ pub fn of(config: &Config) -> anyhow::Result<Description> {
     Ok(Description::of(&*environment))
 }
 
-/// As [`of`], for a run: it has kept what the program that serves its environment has said.
+/// As [`of`], for a run, whose directory keeps the description that the environment's program has given.
 ///
 /// # Errors
 /// As for [`of`], and when `description.json` cannot be read or does not fit the run's spaces.

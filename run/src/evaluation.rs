@@ -70,6 +70,18 @@ pub struct EvaluationSummary {
     pub reached_fraction: Option<f64>,
 }
 
+impl EvaluationSummary {
+    /// The policy with this evaluation.
+    pub(crate) fn of_policy(&self, policy: &PolicyFile) -> PolicyFile {
+        PolicyFile {
+            return_mean: self.return_mean,
+            return_std: self.return_std,
+            episodes: self.episodes.into(),
+            ..policy.clone()
+        }
+    }
+}
+
 /// Evaluation episodes: 0 … `count` − 1 of a seed. They start in the same states every time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EpisodeSet {

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use anyhow::Context;
 
-/// Whether something is at the path. [`Path::exists`] also says no if the path cannot be inspected for the moment; then
-/// files that are there would be replaced or removed.
+/// Whether something is at the path. [`Path::exists`] also returns false if the path cannot be inspected; its caller
+/// could then replace or remove a file that exists.
 ///
 /// # Errors
 /// When the path cannot be inspected.

@@ -81,8 +81,8 @@ pub fn run_jobs<Job: Send, Event: Send>(
     });
 }
 
-/// Runs a training to its end. A signal that `interrupted` returns is passed on to it. `has_finished` is asked when it
-/// has ended without an error: a run that `shoal stop` has ended has not.
+/// Runs a training to its end. A signal that `interrupted` returns is passed on to it. `has_finished` is called after
+/// the training has ended without an error, because that is also how `shoal stop` ends it.
 ///
 /// # Errors
 /// When it cannot be started, was stopped, or fails: its last line.

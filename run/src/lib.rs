@@ -1,5 +1,5 @@
-//! Everything about a run except starting it: its configuration and directory, the resources it needs, its records, and
-//! the evaluation of its policies.
+//! What surrounds a run's roles: its plan and directory, the resources it needs, its records, the evaluation of its
+//! policies, and suites of runs.
 
 pub mod child_process;
 pub mod client;

@@ -10,7 +10,7 @@ pub fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
 
-/// The largest whole number below which a 64-bit float has every whole number.
+/// 2⁵³: a 64-bit float represents every whole number up to it.
 const EXACT: f64 = 9_007_199_254_740_992.0;
 
 /// A count as people write it: `120000`, `120_000`, `1e5`, `1.5e6`, `30k` or `1M`.

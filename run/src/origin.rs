@@ -1,7 +1,7 @@
 //! What a new run begins with: the networks of another run, with its replay if that is asked for, or the rows of a
 //! dataset.
 //!
-//! `origin.json` in the new run's directory is written last: without it the run's beginning was interrupted.
+//! `origin.json` in the new run's directory is written last. If it is missing, the start of the run was interrupted.
 
 use std::path::Path;
 
@@ -280,7 +280,7 @@ impl Predecessor {
         ] {
             if old != new {
                 return refused(format!(
-                    "{what} is {old} in {there} and {new} here, and the rows have it"
+                    "{what} is {old} in {there}, whose rows depend on it, and {new} here"
                 ));
             }
         }

@@ -21,6 +21,7 @@ use shoal_env_server::description::Description;
 
 pub use self::overrides::RunOverrides;
 pub use self::presets::{preset_names, preset_patterns};
+pub(crate) use self::resolve::resolve_interruptibly;
 use self::resolve::{Resolved, resolve_all};
 pub use self::resolve::{resolve, resolve_preset, resolve_with_sources};
 use self::revision::as_written;
@@ -33,6 +34,7 @@ use crate::external_environment::server_location::ServerLocation;
 use crate::origin::{Beginning, Origin, Predecessor};
 use crate::preflight;
 use crate::records::start::StartRecord;
+use crate::signals::Interrupt;
 
 /// A warning, if one is needed, before a run of this configuration starts or continues.
 pub fn warning(config: &Config) -> Option<String> {
@@ -70,7 +72,7 @@ impl Plan {
             mut config,
             description,
             ..
-        } = resolve_all(what, overrides)?;
+        } = resolve_all(what, overrides, Interrupt::default())?;
         let beginning = match (&overrides.from, &overrides.demonstrations) {
             (Some(from), _) => {
                 let predecessor = Predecessor::open(from, overrides.with_replay)?;

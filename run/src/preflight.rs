@@ -74,13 +74,14 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
         }
         Some(max) => format!("allow at most {max} actors (--set actors.max={max})"),
         None => format!(
-            "choose smaller networks ({}.hidden), chunks (actors.chunk_steps), or fewer environments of an actor (actors.envs)",
+            "choose smaller networks ({}.hidden), shorter chunks (actors.chunk_steps) or fewer environments per actor \
+             (actors.envs)",
             config.algorithm.name()
         ),
     };
     bail!(
-        "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice}, end other runs, or enlarge it \
-         (mount -o remount,size=… /dev/shm, or docker run --shm-size=…)",
+        "the run needs {} of /dev/shm for up to {} actors, but only {} are free: {advice}, end other runs, or enlarge \
+         it (mount -o remount,size=… /dev/shm, or docker run --shm-size=…)",
         mebibytes(need),
         config.actors.max,
         mebibytes(free)

@@ -12,7 +12,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::child_process::wait_for_any;
 
-/// Whether a signal has arrived that ends this process in order. By default, none ever arrives.
+/// Tells whether a signal to end this process has arrived. The default never receives one.
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt(Arc<AtomicUsize>);
 
@@ -30,13 +30,13 @@ impl Interrupt {
 static RECEIVERS: Mutex<usize> = Mutex::new(0);
 
 /// Whether there is none.
-static NOBODY: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
+static HAS_NO_RECEIVER: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
 
 /// Changes the number of receivers.
 fn change_receivers(change: impl FnOnce(usize) -> usize) {
     let mut receivers = RECEIVERS.lock().unwrap_or_else(PoisonError::into_inner);
     *receivers = change(*receivers);
-    NOBODY.store(*receivers == 0, Ordering::Relaxed);
+    HAS_NO_RECEIVER.store(*receivers == 0, Ordering::Relaxed);
 }
 
 /// Receives SIGINT, SIGTERM and SIGHUP. Once all `Signals` are dropped, these signals end the process again. A signal
@@ -64,7 +64,7 @@ impl Signals {
                     continue;
                 }
                 // In this order, so that a thread that is woken finds the number.
-                signal_hook::flag::register_conditional_default(signal, Arc::clone(&NOBODY))?;
+                signal_hook::flag::register_conditional_default(signal, Arc::clone(&HAS_NO_RECEIVER))?;
                 signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize)?;
                 signal_hook::low_level::pipe::register(signal, write.try_clone()?)?;
             }

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::file_lock;
 use shoal_common::versioned_file::VersionedFile;
 
+use crate::files::remove_if_any;
 use crate::records::start;
 
 /// The most runs that a suite has.
@@ -262,7 +263,7 @@ impl Suite {
         Ok(())
     }
 
-    /// The settings: the numbers of the runs that differ in nothing but their seed.
+    /// The settings. Each is the list of its runs' numbers, which differ only in their seed.
     fn settings(&self) -> Vec<Vec<usize>> {
         let mut settings: Vec<Vec<usize>> = Vec::new();
         for (number, trial) in self.trials.iter().enumerate() {
@@ -380,18 +381,17 @@ pub fn lock(directory: &Path) -> anyhow::Result<File> {
 ///
 /// # Errors
 /// When a file cannot be removed.
-pub fn remove(directory: &Path) -> std::io::Result<()> {
-    let missing = |error: &std::io::Error| error.kind() == ErrorKind::NotFound;
+pub fn remove(directory: &Path) -> anyhow::Result<()> {
     for file in [
         directory.join("report.html"),
         directory.join(start::FILE),
         file(directory),
     ] {
-        std::fs::remove_file(file).or_else(|error| if missing(&error) { Ok(()) } else { Err(error) })?;
+        remove_if_any(&file)?;
     }
     match std::fs::remove_dir(directory) {
         Err(error) if error.kind() == ErrorKind::DirectoryNotEmpty => Ok(()),
-        removed => removed,
+        removed => removed.with_context(|| format!("cannot remove {}", directory.display())),
     }
 }
 

@@ -1,4 +1,4 @@
-//! The error for a command line that asks for what cannot be.
+//! The error for wrong usage of the command line.
 
 /// Wrong usage of the command line: the program ends with the code for that.
 #[derive(Debug, thiserror::Error)]

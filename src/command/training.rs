@@ -17,7 +17,6 @@ use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
 use shoal_run::description;
 use shoal_run::evaluation::best_policy::{self, FinalResult};
-use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
@@ -101,8 +100,7 @@ fn train_and_report(
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
             Ok(policies) => {
                 evaluated = policies;
-                let recorded = FinalEvaluation::read(run, env_steps)?.map(|result| record_final(run, &result));
-                if let Err(error) = recorded.transpose() {
+                if let Err(error) = record_final(run, env_steps) {
                     say(format!("the final evaluation is not in TensorBoard's records: {error}"));
                 }
             }

@@ -85,10 +85,10 @@ impl Log {
                 }
                 inner.remember(who, text, is_in_log);
             }
-            Line::TooMuch(text) => inner.remember(who, text, false),
+            Line::OverLimit(text) => inner.remember(who, text, false),
             // The log already says that it takes no more lines of programs.
-            Line::LeftOut(_) if inner.program_bytes_left.is_none() => {}
-            Line::LeftOut(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
+            Line::Omitted(_) if inner.program_bytes_left.is_none() => {}
+            Line::Omitted(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
         }
     }
 
@@ -212,7 +212,11 @@ mod tests {
             log.write_left_out("env-server-0");
             assert_eq!(text().matches("too hot").count(), 1);
         }
-        log.line("env-server-1", Line::TooMuch("too much at once"), OutputSource::Program);
+        log.line(
+            "env-server-1",
+            Line::OverLimit("too much at once"),
+            OutputSource::Program,
+        );
         assert!(!text().contains("too much at once"));
         log.write_left_out("env-server-1");
         assert!(text().contains("too much at once"));

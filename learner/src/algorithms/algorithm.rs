@@ -10,7 +10,8 @@ use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// How an algorithm with certain settings learns: creates it, and says beforehand what its state and its work will be.
+/// Creates an algorithm from its settings, and says beforehand how large its state is and how much work its updates
+/// are.
 pub trait AlgorithmDefinition {
     /// The algorithm of a run with this configuration, before its first update.
     ///
@@ -46,9 +47,9 @@ pub trait Algorithm {
     /// Updates so far: gradient steps, or consumed rows for `TransitionUse::Transitions` and `Episodes`.
     fn updates(&self) -> u64;
 
-    /// Makes at least one update from rows before `rows`, and adds what it has made to `updates`. It is called again
-    /// until there are as many updates as those rows allow. An algorithm that consumes rows then has as many as `rows`.
-    /// Returns `None` if nothing was learned from these rows. A loss that is not finite ends the run.
+    /// Makes one or more updates from rows before `rows`, and adds their number to [`updates`](Self::updates). The
+    /// learner calls it until `updates` has reached what the ratio allows for these rows; for an algorithm that
+    /// consumes rows, that is `rows`. Returns `None` if nothing was learned. A loss that is not finite ends the run.
     fn update(&mut self, replay: &Replay, rows: u64) -> Option<Losses>;
 
     /// Shares the work of updates among these threads from now on, if there is enough of it. The bits of the results do

@@ -15,14 +15,14 @@ use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateAr
 use super::minibatch::Minibatch;
 use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
 use crate::networks::digest::sha256;
-use crate::networks::initialise::initialise;
+use crate::networks::initialise::small_output;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
-/// The parts of the algorithm's state, as named in a checkpoint.
-const PARTS: [&str; 8] = [
+/// The arrays of the algorithm's state, as named in a checkpoint.
+const ARRAYS: [&str; 8] = [
     "actor",
     "critic",
     "target actor",
@@ -69,8 +69,8 @@ impl Ddpg {
             threads: Threads::SINGLE,
             updates: 0,
             // Lines 1 and 2: θ at random, θ' ← θ.
-            actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &initialise(&mu, seed, 0)),
-            critic: NetworkWithTarget::new(q, settings.critic_learning_rate, &initialise(&q, seed, 1)),
+            actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &small_output(&mu, seed, 0)),
+            critic: NetworkWithTarget::new(q, settings.critic_learning_rate, &small_output(&q, seed, 1)),
             mu: Pass::new(mu, batch),
             q: Pass::new(q, batch),
             target_mu: Pass::new(mu, batch),
@@ -184,11 +184,11 @@ impl Ddpg {
 
     /// SHA-256 over actor, critic, target actor and target critic as little-endian `f32`, in hexadecimal.
     pub fn digest(&self) -> String {
-        sha256(&self.parts()[..4])
+        sha256(&self.arrays()[..4])
     }
 
-    /// In the order of [`PARTS`].
-    fn parts(&self) -> [&[f32]; 8] {
+    /// In the order of [`ARRAYS`].
+    fn arrays(&self) -> [&[f32]; 8] {
         let (actor, critic) = (&self.actor, &self.critic);
         [
             &actor.online.parameters,
@@ -221,13 +221,13 @@ impl MinibatchAlgorithm for Ddpg {
     }
 
     fn state(&self) -> Vec<StateArray<'_>> {
-        PARTS.into_iter().zip(self.parts()).collect()
+        ARRAYS.into_iter().zip(self.arrays()).collect()
     }
 
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
         let (actor, critic) = (&mut self.actor, &mut self.critic);
-        let parts: [&mut [f32]; 8] = [
+        let arrays: [&mut [f32]; 8] = [
             &mut actor.online.parameters,
             &mut critic.online.parameters,
             &mut actor.target,
@@ -237,7 +237,7 @@ impl MinibatchAlgorithm for Ddpg {
             &mut critic.online.adam.first_moment,
             &mut critic.online.adam.second_moment,
         ];
-        PARTS.into_iter().zip(parts).collect()
+        ARRAYS.into_iter().zip(arrays).collect()
     }
 }
 
@@ -248,7 +248,7 @@ impl AlgorithmDefinition for &config::DdpgConfig {
     }
 
     fn weights(&self) -> &'static [&'static str] {
-        &PARTS[..4]
+        &ARRAYS[..4]
     }
 
     /// With the thesis's networks, three observations and a batch of 64 they take 140 million operations, nearly all of

@@ -17,8 +17,8 @@ use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
-/// The names of the network's numbers in a checkpoint: parameters, target, moments.
-const PARTS: [&str; 4] = [
+/// The names of the network's arrays in a checkpoint: parameters, target, moments.
+const ARRAYS: [&str; 4] = [
     "action-values",
     "target action-values",
     "action-values' first moment",
@@ -141,7 +141,7 @@ impl Dqn {
             q_mean += share * q;
             d[first + action] = share * clipped;
             if self.settings.dueling {
-                spread(d.as_mut_slice());
+                split_into_heads(d.as_mut_slice());
             }
         }
         let online = &mut self.network.online;
@@ -152,8 +152,8 @@ impl Dqn {
     }
 }
 
-/// Turns ∂L/∂Q behind the first number into ∂L/∂(V, A).
-fn spread(d: &mut [f32]) {
+/// Backward pass of `combine_heads`: `d` holds ∂L/∂Q from its second number on, and afterwards ∂L/∂(V, A).
+fn split_into_heads(d: &mut [f32]) {
     if let [d_value, d_advantages @ ..] = d {
         *d_value = d_advantages.iter().sum();
         let mean = *d_value / d_advantages.len() as f32;
@@ -181,16 +181,16 @@ impl MinibatchAlgorithm for Dqn {
     fn state(&self) -> Vec<StateArray<'_>> {
         let NetworkWithTarget { online, target } = &self.network;
         let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
-        let numbers: [&[f32]; 4] = [&online.parameters, target, m, v];
-        PARTS.into_iter().zip(numbers).collect()
+        let arrays: [&[f32]; 4] = [&online.parameters, target, m, v];
+        ARRAYS.into_iter().zip(arrays).collect()
     }
 
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
         let NetworkWithTarget { online, target } = &mut self.network;
         let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
-        let numbers: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
-        PARTS.into_iter().zip(numbers).collect()
+        let arrays: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
+        ARRAYS.into_iter().zip(arrays).collect()
     }
 }
 
@@ -201,7 +201,7 @@ impl AlgorithmDefinition for &config::DqnConfig {
     }
 
     fn weights(&self) -> &'static [&'static str] {
-        &PARTS[..2]
+        &ARRAYS[..2]
     }
 
     fn products(&self, spec: &EnvironmentSpec) -> Products {

@@ -11,8 +11,8 @@ use crate::replay::Replay;
 /// Added to a variance before its root is taken.
 const VARIANCE_FLOOR: f64 = 1e-8;
 
-/// Changes the number of rows looked at in a saved state for a new replay that begins with the rows `copied` of the
-/// state's own replay.
+/// Adapts a saved state to a new replay that begins with the rows `copied` of the state's own replay: the number of
+/// rows looked at becomes the number of copied rows that were looked at.
 pub(super) fn begin_with_rows(state: &mut [f32], copied: Range<u64>) {
     let [first, second, ..] = state else { return };
     let looked_at: f64 = bytemuck::cast([*first, *second]);
@@ -20,8 +20,8 @@ pub(super) fn begin_with_rows(state: &mut [f32], copied: Range<u64>) {
     [*first, *second] = bytemuck::cast(of_copied as f64);
 }
 
-/// Mean and variance of the observations in the rows of a replay. Each row is counted once: the state has the number of
-/// rows counted so far.
+/// Mean and variance of the observations in the rows of a replay. Each row is counted at most once: the state has the
+/// number of rows looked at so far.
 #[derive(Clone, Debug)]
 pub(super) struct Normaliser {
     width: usize,
@@ -41,7 +41,8 @@ impl Normaliser {
         2 * (2 + 2 * width)
     }
 
-    /// Before the first observation of `width` numbers: numbers are only clipped.
+    /// The statistics before the first observation, for observations of `width` numbers. With them, observations are
+    /// only clipped.
     pub(super) fn new(width: usize) -> Self {
         let mut new = Self {
             width,

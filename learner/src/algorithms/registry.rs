@@ -39,9 +39,10 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
     learned.chain(statistics).collect()
 }
 
-/// The state of the algorithm `fresh` with the arrays `weights` of another one's state `saved`. The optimisers start
-/// from their initial state. The new replay begins with the rows `copied` of the other one; the statistics of
-/// observations include those that the other one had counted.
+/// The first state of a run that begins with the weights of another run. The arrays named in `weights` come from the
+/// other run's state `saved`; all others, such as the optimisers' moments, come from the new algorithm `fresh`.
+/// `copied` are the rows of the other replay that the new one begins with. The statistics of observations keep what the
+/// other run had counted, so these rows are not counted again.
 ///
 /// # Errors
 /// When the other state lacks a part, or has it in another shape.
@@ -64,13 +65,13 @@ pub fn inherited(
     fresh.state().into_iter().map(array).collect()
 }
 
-/// The matrix products of one or a few updates of that algorithm; none if it has no networks, or if its updates
-/// have no fixed size.
+/// The matrix products of one or a few updates of the configuration's algorithm; none if it has no networks, or if its
+/// updates have no fixed size.
 pub fn products(config: &Config) -> Products {
     definition(&config.algorithm).products(&config.spec)
 }
 
-/// The total length of that algorithm's state, computed without creating the algorithm.
+/// The total length of the state of the configuration's algorithm, computed without creating it.
 pub fn state_numbers(config: &Config) -> usize {
     let statistics = if config.observation.normalise {
         Normaliser::state_numbers(config.spec.observation.width())

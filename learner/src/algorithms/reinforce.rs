@@ -2,10 +2,10 @@
 //!
 //! Symbols as there: policy π with parameters θ, return G, baseline V with parameters θ_v, δ = G − V(s).
 //!
-//! Algorithm 3 leaves some choices. Here, its line 6 is averaged over an episode's time steps, and Adam takes one step
-//! per episode, so that the whole episode was collected with the policy that the step starts from. With several actors,
-//! a round has an episode of each, and the step follows their mean. `docs/REPRODUCTION.md` describes the effect of
-//! other choices.
+//! Algorithm 3 leaves some choices open. Here, line 6 is averaged over the time steps of an episode, and Adam takes one
+//! step per episode: the whole episode was collected with the policy that the step changes. With several actors, a
+//! round has one episode of each, and the step follows the mean of their gradients. `docs/REPRODUCTION.md` describes
+//! the effect of other choices.
 
 use std::borrow::Cow;
 
@@ -26,7 +26,7 @@ use crate::networks::trainable::TrainableNetwork;
 use crate::replay::Replay;
 
 /// Added to a standard deviation before dividing by it. An episode whose returns are all equal then has no weight.
-const SPREAD_FLOOR: f32 = 1e-8;
+const STD_FLOOR: f32 = 1e-8;
 
 /// A network that learns, with its pass over the steps of a round.
 #[derive(Clone, Debug)]
@@ -50,8 +50,7 @@ impl NetworkWithPass {
         self.pass.forward(&self.network.parameters, s.as_slice(), &[]);
     }
 
-    /// Takes one step of Adam against the gradient that follows from the first `steps` columns of `d` and the forward
-    /// pass before.
+    /// Takes one step of Adam. The gradient is that of the last forward pass and of the first `steps` columns of `d`.
     fn step(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
         self.pass.backward(
@@ -134,11 +133,11 @@ impl Reinforce {
         for episode in &episodes {
             let share = 1.0 / (episode.len() * episodes.len()) as f32;
             let returns = returns(episode);
-            let (mean, spread) = mean_and_spread(&returns);
+            let (mean, std) = mean_and_population_std(&returns);
             let mut gamma_t = 1.0;
             for (step, g) in episode.iter().zip(&returns) {
                 let weight = match (self.settings.weight, &mut self.baseline) {
-                    (ReturnWeighting::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
+                    (ReturnWeighting::Normalised, _) => (g - mean) / (std + STD_FLOOR),
                     (_, Some(baseline)) => {
                         // The gradient of ½ δ² (equation 3.22).
                         let delta = g - baseline.pass.output[column];
@@ -151,13 +150,9 @@ impl Reinforce {
                 let logits = self.policy.pass.output.column(column);
                 let mut d = self.policy.d.column_mut(column);
                 let action = (step.a[0] as usize).min(logits.len() - 1);
-                let ln_normaliser = ln_sum_exp(logits.as_slice());
-                // The gradient of −weight · ln π(a|s): weight · (π(·|s) − 1[·= a]).
                 let scale = share * gamma_t * weight;
-                for (k, (d, logit)) in d.iter_mut().zip(logits.iter()).enumerate() {
-                    *d = scale * ((logit - ln_normaliser).exp() - f32::from(u8::from(k == action)));
-                }
-                losses.actor_loss -= scale * (logits[action] - ln_normaliser);
+                let ln_pi = policy_gradient(logits.as_slice(), action, scale, d.as_mut_slice());
+                losses.actor_loss -= scale * ln_pi;
                 losses.q_mean += share * g;
                 if self.settings.discount_steps {
                     gamma_t *= step.discount;
@@ -189,7 +184,8 @@ impl Reinforce {
     }
 }
 
-/// Line 5: G of each step, from the last one back. Nothing is added after the last one, whatever ended the episode.
+/// Line 5: G of each step, computed backwards. The state after the last step adds no value, whether the episode was
+/// terminated or truncated.
 fn returns(episode: &[Transition<'_>]) -> Vec<f32> {
     let mut returns: Vec<f32> = episode
         .iter()
@@ -203,12 +199,21 @@ fn returns(episode: &[Transition<'_>]) -> Vec<f32> {
     returns
 }
 
-/// Mean and standard deviation of the numbers.
-fn mean_and_spread(numbers: &[f32]) -> (f32, f32) {
+/// Mean and standard deviation of the numbers (divided by n, not by n − 1).
+fn mean_and_population_std(numbers: &[f32]) -> (f32, f32) {
     let n = numbers.len() as f32;
     let mean = numbers.iter().sum::<f32>() / n;
     let squares: f32 = numbers.iter().map(|number| (number - mean).powi(2)).sum();
     (mean, (squares / n).sqrt())
+}
+
+/// Writes the gradient of −scale · ln π(a|s) into `d`: scale · (π(·|s) − 1[· = a]). Returns ln π(a|s).
+fn policy_gradient(logits: &[f32], action: usize, scale: f32, d: &mut [f32]) -> f32 {
+    let ln_normaliser = ln_sum_exp(logits);
+    for (k, (d, logit)) in d.iter_mut().zip(logits).enumerate() {
+        *d = scale * ((logit - ln_normaliser).exp() - f32::from(u8::from(k == action)));
+    }
+    logits[action] - ln_normaliser
 }
 
 fn ln_sum_exp(logits: &[f32]) -> f32 {

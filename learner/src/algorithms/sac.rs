@@ -28,10 +28,10 @@ use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::{TrainableNetwork, threads_for};
 
-/// The names of the actor's numbers in a checkpoint: parameters, moments.
+/// The names of the actor's arrays in a checkpoint: parameters, moments.
 const ACTOR: [&str; 3] = ["actor", "actor's first moment", "actor's second moment"];
 
-/// The names of the temperature's numbers: ln α, moments.
+/// The names of the temperature's arrays: ln α, moments.
 const TEMPERATURE: [&str; 3] = [
     "log temperature",
     "log temperature's first moment",
@@ -360,8 +360,8 @@ impl MinibatchAlgorithm for Sac {
         let actor: [&[f32]; 3] = [parameters, &adam.first_moment, &adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &self.temperature;
         let temperature: [&[f32]; 3] = [log_alpha, &adam.first_moment, &adam.second_moment];
-        let numbers = actor.into_iter().chain(self.critics.numbers().into_iter().flatten());
-        names().zip(numbers.chain(temperature)).collect()
+        let arrays = actor.into_iter().chain(self.critics.arrays().into_iter().flatten());
+        array_names().zip(arrays.chain(temperature)).collect()
     }
 
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
@@ -370,15 +370,13 @@ impl MinibatchAlgorithm for Sac {
         let actor: [&mut [f32]; 3] = [parameters, &mut adam.first_moment, &mut adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &mut self.temperature;
         let temperature: [&mut [f32]; 3] = [log_alpha, &mut adam.first_moment, &mut adam.second_moment];
-        let numbers = actor
-            .into_iter()
-            .chain(self.critics.numbers_mut().into_iter().flatten());
-        names().zip(numbers.chain(temperature)).collect()
+        let arrays = actor.into_iter().chain(self.critics.arrays_mut().into_iter().flatten());
+        array_names().zip(arrays.chain(temperature)).collect()
     }
 }
 
-/// The names of all parts of the state.
-fn names() -> impl Iterator<Item = &'static str> {
+/// The names of all arrays of the state.
+fn array_names() -> impl Iterator<Item = &'static str> {
     let critics = twin_critics::ARRAYS.into_iter().flatten();
     ACTOR.into_iter().chain(critics).chain(TEMPERATURE)
 }

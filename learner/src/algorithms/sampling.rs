@@ -9,15 +9,15 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 /// Draws minibatches.
 #[derive(Clone, Debug)]
 pub struct Sampler {
-    /// Stream 0, word 0; update u draws from stream u of the same key.
-    key: Stream,
+    /// Part `u` of this stream has the row numbers of update number `u`.
+    stream: Stream,
 }
 
 impl Sampler {
     /// The sampler of a run.
     pub fn new(seed: u64) -> Self {
         Self {
-            key: stream(seed, Purpose::Sampling, 0, 0),
+            stream: stream(seed, Purpose::Sampling, 0, 0),
         }
     }
 
@@ -32,7 +32,7 @@ impl Sampler {
     pub fn indices(&self, update: u64, range: Range<u64>, out: &mut [u64]) {
         assert!(!range.is_empty(), "cannot draw a minibatch from an empty range");
         let rows = range.end - range.start;
-        let mut numbers = self.key.clone();
+        let mut numbers = self.stream.clone();
         seek(&mut numbers, update);
         for index in out {
             let scaled = u128::from(numbers.next_u64()) * u128::from(rows);
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn every_row_of_the_window_is_drawn_equally_often_and_no_other() {
+    fn every_row_of_the_range_is_drawn_equally_often_and_no_other() {
         let mut counts = [0; 10];
         for update in 0..1000 {
             for index in draw(3, update, 90..100) {

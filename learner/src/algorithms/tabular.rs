@@ -47,12 +47,12 @@ impl AlgorithmDefinition for TabularDefinition<'_> {
 
     /// The table, a pending step for each environment, and the two halves of a row's number.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-        self.settings.learned(spec).parameters() + slots(sizes) * PENDING + 2
+        self.settings.learned(spec).parameters() + environment_count(sizes) * PENDING + 2
     }
 }
 
 /// The number of environments of all actors.
-fn slots(sizes: RunSizes) -> usize {
+fn environment_count(sizes: RunSizes) -> usize {
     sizes.actors as usize * sizes.envs as usize
 }
 
@@ -67,9 +67,9 @@ pub struct Tabular {
     q: Vec<f32>,
     /// SARSA: for each environment, the [`Pending`] step whose a' is not known yet.
     pending: Vec<f32>,
-    /// The row from which rounds are whole: the last round of a run may be cut off, and the run then get more steps.
-    /// The two halves of a `u64`.
-    slots_from: [f32; 2],
+    /// The row at which the present sequence of whole rounds began: a run may end in the middle of a round and get more
+    /// steps later. Stored as the two halves of a `u64`.
+    rounds_begin: [f32; 2],
     sizes: RunSizes,
     rows: u64,
 }
@@ -91,7 +91,7 @@ impl Tabular {
     /// Names of the arrays that hold what was learned.
     const WEIGHTS: [&'static str; 1] = ["action-values"];
     const PENDING: &'static str = "steps without successor";
-    const SLOTS_FROM: &'static str = "first row of whole rounds";
+    const ROUNDS_BEGIN: &'static str = "first row of whole rounds";
 
     /// A table of zeros for an environment like `spec`.
     ///
@@ -110,15 +110,15 @@ impl Tabular {
             layout: scores.layout(),
             actions: scores.actions(),
             q: vec![0.0; scores.layout().parameters()],
-            pending: vec![0.0; slots(sizes) * PENDING],
-            slots_from: [0.0; 2],
+            pending: vec![0.0; environment_count(sizes) * PENDING],
+            rounds_begin: [0.0; 2],
             sizes,
             rows: 0,
         })
     }
 
-    /// Learns from one transition of the environment in `slot`; `None` if nothing could be learned yet.
-    fn learn(&mut self, transition: &Transition<'_>, slot: usize) -> Option<Losses> {
+    /// Learns from one transition of this environment; `None` if nothing could be learned yet.
+    fn learn(&mut self, transition: &Transition<'_>, environment: usize) -> Option<Losses> {
         let step = Pending {
             s: self.state_of(transition.s[0]),
             a: (transition.a[0] as usize).min(self.actions - 1),
@@ -132,8 +132,8 @@ impl Tabular {
             return Some(self.update_value(&step, greatest));
         }
         let mut losses = None;
-        // The step before may lack its successor, because that was not finite.
-        let before = self.take_pending(slot).filter(|before| before.s_next == step.s);
+        // If the row in between was skipped because it was not finite, the pending step does not lead to this one.
+        let before = self.take_pending(environment).filter(|before| before.s_next == step.s);
         if let Some(before) = before {
             let value = self.values(before.s_next)[step.a];
             losses = Some(self.update_value(&before, value));
@@ -141,7 +141,7 @@ impl Tabular {
         if step.discount == 0.0 {
             losses = Some(self.update_value(&step, 0.0));
         } else if !transition.last {
-            self.put_pending(slot, &step);
+            self.put_pending(environment, &step);
         }
         // If the time limit ended the episode, no a' was chosen, and nothing is learned from its last step.
         losses
@@ -173,32 +173,32 @@ impl Tabular {
         (observation as usize).min(self.q.len() / self.actions - 1)
     }
 
-    /// The environment of a row: from row `slots_from` on, actors take turns with full chunks, and environments take
+    /// The environment of a row: from row `rounds_begin` on, actors take turns with full chunks, and environments take
     /// turns within a chunk.
-    fn slot(&self, row: u64) -> usize {
-        let row = row - self.slots_from();
+    fn environment(&self, row: u64) -> usize {
+        let row = row - self.rounds_begin();
         let (chunk, actors) = (self.sizes.chunk_rows as u64, u64::from(self.sizes.actors));
         let envs = u64::from(self.sizes.envs);
         (row / chunk % actors * envs + row % chunk % envs) as usize
     }
 
-    fn slots_from(&self) -> u64 {
-        bytemuck::cast(self.slots_from)
+    fn rounds_begin(&self) -> u64 {
+        bytemuck::cast(self.rounds_begin)
     }
 
-    fn take_pending(&mut self, slot: usize) -> Option<Pending> {
-        let slot = &mut self.pending[slot * PENDING..][..PENDING];
-        let exists = std::mem::take(&mut slot[0]) != 0.0;
+    fn take_pending(&mut self, environment: usize) -> Option<Pending> {
+        let numbers = &mut self.pending[environment * PENDING..][..PENDING];
+        let exists = std::mem::take(&mut numbers[0]) != 0.0;
         exists.then(|| Pending {
-            s: slot[1] as usize,
-            a: slot[2] as usize,
-            r: slot[3],
-            discount: slot[4],
-            s_next: slot[5] as usize,
+            s: numbers[1] as usize,
+            a: numbers[2] as usize,
+            r: numbers[3],
+            discount: numbers[4],
+            s_next: numbers[5] as usize,
         })
     }
 
-    fn put_pending(&mut self, slot: usize, step: &Pending) {
+    fn put_pending(&mut self, environment: usize, step: &Pending) {
         let numbers = [
             1.0,
             step.s as f32,
@@ -207,7 +207,7 @@ impl Tabular {
             step.discount,
             step.s_next as f32,
         ];
-        self.pending[slot * PENDING..][..PENDING].copy_from_slice(&numbers);
+        self.pending[environment * PENDING..][..PENDING].copy_from_slice(&numbers);
     }
 }
 
@@ -235,38 +235,37 @@ impl Algorithm for Tabular {
             );
         }
         self.rows = row + 1;
-        let slot = self.slot(row);
+        let environment = self.environment(row);
         let numbers = replay.row(row);
         if !are_finite(numbers) {
-            // From an earlier version, which did not check its rows. The step before has lost its
-            // successor.
-            self.take_pending(slot);
+            // Earlier versions did not check rows. The pending step has lost its successor.
+            self.take_pending(environment);
             return None;
         }
-        self.learn(&replay.layout().row.read(numbers), slot)
+        self.learn(&replay.layout().row.read(numbers), environment)
     }
 
     fn state(&self) -> Vec<StateArray<'_>> {
         vec![
             (Self::WEIGHTS[0], &self.q),
             (Self::PENDING, &self.pending),
-            (Self::SLOTS_FROM, &self.slots_from),
+            (Self::ROUNDS_BEGIN, &self.rounds_begin),
         ]
     }
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
         self.q = saved.take(Self::WEIGHTS[0], self.q.len())?;
-        // Q-learning has none, and the number of its actors may have changed.
+        // Q-learning has no pending steps, and its number of actors, and so the length of this array, may have changed.
         if self.bootstrap == Bootstrap::NextAction {
             self.pending = saved.take(Self::PENDING, self.pending.len())?;
-            // Earlier versions have not saved it.
-            if let Some([first, second]) = saved.take_if_any(Self::SLOTS_FROM, 2)?.as_deref() {
-                self.slots_from = [*first, *second];
+            // Earlier versions did not save it.
+            if let Some([first, second]) = saved.take_if_any(Self::ROUNDS_BEGIN, 2)?.as_deref() {
+                self.rounds_begin = [*first, *second];
             }
             let round = self.sizes.chunk_rows as u64 * u64::from(self.sizes.actors);
-            if !updates.wrapping_sub(self.slots_from()).is_multiple_of(round) {
+            if !updates.wrapping_sub(self.rounds_begin()).is_multiple_of(round) {
                 // The last round was cut off. The next rows begin a new one, and follow none of these steps.
-                self.slots_from = bytemuck::cast(updates);
+                self.rounds_begin = bytemuck::cast(updates);
                 self.pending.fill(0.0);
             }
         }

@@ -23,7 +23,7 @@ use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
-/// The names of the actor's numbers in a checkpoint: parameters, target, moments.
+/// The names of the actor's arrays in a checkpoint: parameters, target, moments.
 const ACTOR: [&str; 4] = ["actor", "target actor", "actor's first moment", "actor's second moment"];
 
 /// What is learned, as opposed to the state of the optimisers.
@@ -200,8 +200,8 @@ impl MinibatchAlgorithm for Td3 {
         let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
         let actor: [&[f32]; 4] = [&online.parameters, target, m, v];
         let names = ACTOR.into_iter().chain(twin_critics::ARRAYS.into_iter().flatten());
-        let numbers = actor.into_iter().chain(self.critics.numbers().into_iter().flatten());
-        names.zip(numbers).collect()
+        let arrays = actor.into_iter().chain(self.critics.arrays().into_iter().flatten());
+        names.zip(arrays).collect()
     }
 
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
@@ -210,10 +210,8 @@ impl MinibatchAlgorithm for Td3 {
         let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
         let actor: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
         let names = ACTOR.into_iter().chain(twin_critics::ARRAYS.into_iter().flatten());
-        let numbers = actor
-            .into_iter()
-            .chain(self.critics.numbers_mut().into_iter().flatten());
-        names.zip(numbers).collect()
+        let arrays = actor.into_iter().chain(self.critics.arrays_mut().into_iter().flatten());
+        names.zip(arrays).collect()
     }
 }
 

@@ -12,7 +12,7 @@ use crate::networks::product::{self, Product};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::NetworkWithTarget;
 
-/// The names of the critics' numbers in a checkpoint: parameters, target, moments.
+/// The names of the critics' arrays in a checkpoint: parameters, target, moments.
 pub(super) const ARRAYS: [[&str; 4]; 2] = [
     [
         "critic 1",
@@ -171,8 +171,8 @@ impl TwinCritics {
         CriticLosses { loss, q_mean }
     }
 
-    /// Their numbers, in the order of [`ARRAYS`].
-    pub(super) fn numbers(&self) -> [[&[f32]; 4]; 2] {
+    /// Their arrays, in the order of [`ARRAYS`].
+    pub(super) fn arrays(&self) -> [[&[f32]; 4]; 2] {
         self.critics.each_ref().map(|critic| {
             let NetworkWithTarget { online, target } = &critic.network;
             let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
@@ -180,8 +180,8 @@ impl TwinCritics {
         })
     }
 
-    /// As [`numbers`](Self::numbers).
-    pub(super) fn numbers_mut(&mut self) -> [[&mut [f32]; 4]; 2] {
+    /// As [`arrays`](Self::arrays).
+    pub(super) fn arrays_mut(&mut self) -> [[&mut [f32]; 4]; 2] {
         self.critics.each_mut().map(|critic| {
             let NetworkWithTarget { online, target } = &mut critic.network;
             let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);

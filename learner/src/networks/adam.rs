@@ -38,13 +38,13 @@ impl Adam {
     ///
     /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
     pub fn step(&mut self, threads: &Threads, t: u64, gradient: &[f32], parameters: &mut [f32]) {
-        let bias = self.bias(t);
+        let correction = self.bias_correction(t);
         let cut = cut(threads, parameters.len());
         let part = |gradient: &[f32], m: &mut [f32], v: &mut [f32], parameters: &mut [f32]| {
             let moments = m.iter_mut().zip(v);
             Arch::new().dispatch(|| {
                 for ((g, (m, v)), weight) in gradient.iter().zip(moments).zip(parameters) {
-                    *weight -= bias.step(*g, m, v);
+                    *weight -= correction.step(*g, m, v);
                 }
             });
         };
@@ -68,14 +68,14 @@ impl Adam {
         tau: f32,
         target: &mut [f32],
     ) {
-        let bias = self.bias(t);
+        let correction = self.bias_correction(t);
         let cut = cut(threads, parameters.len());
         let part = |gradient: &[f32], m: &mut [f32], v: &mut [f32], parameters: &mut [f32], target: &mut [f32]| {
             let moments = m.iter_mut().zip(v);
             let weights = parameters.iter_mut().zip(target);
             Arch::new().dispatch(|| {
                 for ((g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
-                    *weight -= bias.step(*g, m, v);
+                    *weight -= correction.step(*g, m, v);
                     *target += tau * (*weight - *target);
                 }
             });
@@ -91,10 +91,10 @@ impl Adam {
         );
     }
 
-    fn bias(&self, t: u64) -> Bias {
-        Bias {
+    fn bias_correction(&self, t: u64) -> BiasCorrection {
+        BiasCorrection {
             step_size: (self.learning_rate / (1.0 - BETA_1.powf(t as f64))) as f32,
-            correction: (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32,
+            second_moment: (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32,
         }
     }
 }
@@ -106,12 +106,12 @@ fn cut(threads: &Threads, parameters: usize) -> usize {
 
 /// The bias correction of learning rate and moments, which depends on a step's number.
 #[derive(Clone, Copy)]
-struct Bias {
+struct BiasCorrection {
     step_size: f32,
-    correction: f32,
+    second_moment: f32,
 }
 
-impl Bias {
+impl BiasCorrection {
     /// Updates the moments of a parameter with its gradient `g`. Returns how far the parameter moves against `g`.
     #[inline(always)]
     fn step(self, g: f32, m: &mut f32, v: &mut f32) -> f32 {
@@ -120,11 +120,11 @@ impl Bias {
         let g = floored(g, FIRST_MOMENT_FLOOR);
         *m = floored(*m + fresh_1 * (g - *m), FIRST_MOMENT_FLOOR);
         *v = floored(*v + fresh_2 * (g * g - *v), SECOND_MOMENT_FLOOR);
-        self.step_size * *m / (v.sqrt() * self.correction + EPSILON)
+        self.step_size * *m / (v.sqrt() * self.second_moment + EPSILON)
     }
 }
 
-/// `x`, or 0 where it is closer to zero than `floor`.
+/// `x`, or 0 if it is closer to zero than `floor`.
 #[inline(always)]
 fn floored(x: f32, floor: f32) -> f32 {
     if x.abs() < floor { 0.0 } else { x }

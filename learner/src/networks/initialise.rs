@@ -12,7 +12,7 @@ const OUTPUT_BOUND: f32 = 3e-3;
 /// ±3e-3.
 ///
 /// `index` distinguishes the networks of one run.
-pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
+pub fn small_output(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     let output_layer = layout.hidden().layers.len();
     uniform(layout, seed, index, |layer, inputs| {
         if layer == output_layer {
@@ -23,7 +23,7 @@ pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     })
 }
 
-/// As [`initialise`], but the output layer is uniform within ±1/√fan-in too, as is the default of PyTorch's layers.
+/// As [`small_output`], but the output layer is uniform within ±1/√fan-in too, as is the default of PyTorch's layers.
 pub fn fan_in(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     uniform(layout, seed, index, |_, inputs| fan_in_bound(inputs))
 }
@@ -86,7 +86,7 @@ mod tests {
             (Hidden::tanh([40, 30, 20]), vec![3.0, 42.0, 30.0]),
         ] {
             let layout = NetworkLayout::critic(3, hidden, 2);
-            let parameters = initialise(&layout, 7, 1);
+            let parameters = small_output(&layout, 7, 1);
             assert_eq!(parameters.len(), layout.parameters());
             let bounds = inputs.into_iter().map(|inputs: f32| 1.0 / inputs.sqrt()).chain([3e-3]);
             for (range, bound) in layout.layer_ranges().zip(bounds) {
@@ -102,8 +102,8 @@ mod tests {
     #[test]
     fn seed_and_index_determine_the_weights() {
         let layout = NetworkLayout::new(3, Hidden::relu([8, 6]), 1);
-        assert_eq!(initialise(&layout, 1, 0), initialise(&layout, 1, 0));
-        assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 2, 0));
-        assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 1, 1));
+        assert_eq!(small_output(&layout, 1, 0), small_output(&layout, 1, 0));
+        assert_ne!(small_output(&layout, 1, 0), small_output(&layout, 2, 0));
+        assert_ne!(small_output(&layout, 1, 0), small_output(&layout, 1, 1));
     }
 }

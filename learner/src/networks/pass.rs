@@ -22,7 +22,7 @@ pub struct Pass {
     /// The output layer's values, linear.
     pub output: DMatrix<f32>,
     /// ∂L/∂z of each hidden layer.
-    d: Vec<DMatrix<f32>>,
+    dz: Vec<DMatrix<f32>>,
 }
 
 impl Pass {
@@ -35,7 +35,7 @@ impl Pass {
                 .map(|(inputs, _)| zeros(inputs))
                 .collect(),
             output: zeros(layout.outputs()),
-            d: layout.hidden().layers.iter().map(|units| zeros(*units)).collect(),
+            dz: layout.hidden().layers.iter().map(|units| zeros(*units)).collect(),
             layout,
         }
     }
@@ -56,7 +56,7 @@ impl Pass {
         gradient: &mut [f32],
     ) {
         // With three or more hidden layers, products below the last layer are large enough to share.
-        if self.d.len() > 2 {
+        if self.dz.len() > 2 {
             let cut = threads.first_share(d.ncols());
             let d = d.as_slice().split_at(cut * d.nrows());
             let (mut first, mut second) = self.samples().split_at(cut);
@@ -77,13 +77,13 @@ impl Pass {
             joined: self.joined.as_mut_slice(),
             h: each_layer(&mut self.h),
             output: self.output.as_mut_slice(),
-            d: each_layer(&mut self.d),
+            dz: each_layer(&mut self.dz),
         }
     }
 
-    /// Computes ∂L/∂θ. Requires [`forward`](Self::forward), and [`Samples::backward`] down to the second layer (1) for
-    /// all samples. The threads share the units that a layer's weights are multiplied by, and the gradient that is
-    /// passed down to the first layer.
+    /// Computes ∂L/∂θ. [`forward`](Self::forward) and, for all samples, [`Samples::backward`] down to layer 1 must come
+    /// before. Each thread takes a part of the first layer's units with the second layer's inputs, and of the inputs of
+    /// the layers between the second and the last.
     pub fn gradients(
         &mut self,
         threads: &Threads,
@@ -103,7 +103,7 @@ impl Pass {
         let mut rest = gradient;
         for layer in (2..=last).rev() {
             // The output layer's ∂L/∂z is `d` itself.
-            let d = self.d.get(layer).unwrap_or(d);
+            let d = self.dz.get(layer).unwrap_or(d);
             let (inputs, outputs) = self.layout.layer_size(layer);
             let range = self.layout.layer_range(layer);
             let (below, own) = rest.split_at_mut(range.weights.start);
@@ -137,11 +137,7 @@ impl Pass {
         gradient: &mut [f32],
     ) {
         let Self {
-            layout,
-            joined,
-            h,
-            d: dz,
-            ..
+            layout, joined, h, dz, ..
         } = self;
         let activation = layout.hidden().activation;
         let batch = d.ncols();
@@ -172,7 +168,7 @@ impl Pass {
                 d1.sum_into(b1);
                 weight_gradient(d1.as_mat(), matrix(x, inputs), to_w1);
             };
-        // The action inputs come last: the second thread has them, or the only one.
+        // The action inputs come last, so they belong to the second thread, or to the only one.
         let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
         let units = Columns::new(h[0].as_slice(), inputs_2);
         let units = (units.rows(0, cut), units.rows(cut, inputs_2 - cut));
@@ -230,7 +226,7 @@ pub struct Samples<'a> {
     h: EachLayer<'a>,
     /// The output layer's values, linear.
     pub output: &'a mut [f32],
-    d: EachLayer<'a>,
+    dz: EachLayer<'a>,
 }
 
 impl<'a> Samples<'a> {
@@ -240,15 +236,15 @@ impl<'a> Samples<'a> {
         let joined = self.joined.split_at_mut(samples * rows_of_joined(layout));
         let h = split_each(self.h, samples, layout.layer_sizes().skip(1).map(|(inputs, _)| inputs));
         let output = self.output.split_at_mut(samples * layout.outputs());
-        let d = split_each(self.d, samples, layout.hidden().layers.iter().copied());
-        let part = |joined, h, output, d| Self {
+        let dz = split_each(self.dz, samples, layout.hidden().layers.iter().copied());
+        let part = |joined, h, output, dz| Self {
             layout,
             joined,
             h,
             output,
-            d,
+            dz,
         };
-        (part(joined.0, h.0, output.0, d.0), part(joined.1, h.1, output.1, d.1))
+        (part(joined.0, h.0, output.0, dz.0), part(joined.1, h.1, output.1, dz.1))
     }
 
     /// As [`Pass::forward`], for these samples.
@@ -267,7 +263,7 @@ impl<'a> Samples<'a> {
         let layout = self.layout;
         let Hidden { layers, activation } = layout.hidden();
         let mut d_above = d;
-        let hidden = self.d.iter_mut().zip(&self.h).zip(layers.iter()).enumerate();
+        let hidden = self.dz.iter_mut().zip(&self.h).zip(layers.iter()).enumerate();
         for (layer, ((d, h), units)) in hidden.skip(lowest).rev() {
             let (inputs, outputs) = layout.layer_size(layer + 1);
             let w = &layout.layer(layer + 1, parameters).weights[..units * outputs];
@@ -290,7 +286,7 @@ impl<'a> Samples<'a> {
         let weights = &layout.layer(layer, parameters).weights[own_inputs * units..];
         input_gradient(
             matrix(weights, units),
-            matrix(self.d[layer], units),
+            matrix(self.dz[layer], units),
             matrix_mut(to, layout.action_inputs()),
         );
     }

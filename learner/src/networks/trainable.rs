@@ -13,8 +13,8 @@ const MIN_SPLIT: usize = 4;
 /// As [`MIN_SPLIT`], for samples times units of each hidden layer but the first (or of the only one).
 const MIN_WORK: usize = 8_192;
 
-/// The threads, if two of them can share the work for `batch` samples of a network without another result; otherwise
-/// the calling thread alone.
+/// `threads`, if sharing the work for `batch` samples of this network leaves the bits of the result unchanged;
+/// otherwise the calling thread alone.
 pub fn threads_for(layout: &NetworkLayout, batch: usize, threads: Threads) -> Threads {
     let layers = layout.hidden().layers;
     let others = layers.len() - 1;

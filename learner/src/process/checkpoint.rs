@@ -129,7 +129,7 @@ pub struct Checkpoints {
     directory: PathBuf,
     fingerprint: u64,
     /// Whether `latest.ckpt` exists and is whole; `None` if that has not been checked.
-    latest_is_sound: Option<bool>,
+    latest_is_whole: Option<bool>,
     hook: fn(SaveStep),
 }
 
@@ -154,13 +154,13 @@ impl Checkpoints {
         Self {
             directory: directory.into(),
             fingerprint,
-            latest_is_sound: None,
+            latest_is_whole: None,
             hook: |_| (),
         }
     }
 
-    /// Bytes of disk that the checkpoints in `directory` occupy, with one that a killed learner has left unfinished. The
-    /// next ones take their place.
+    /// Bytes of disk that the checkpoints in `directory` occupy, including one that a killed learner left unfinished.
+    /// Later checkpoints replace all of them.
     pub(crate) fn allocated_bytes(directory: &Path) -> u64 {
         let names = [LATEST, PREVIOUS, "latest.ckpt.new"];
         names.map(|name| allocated_bytes(&directory.join(name))).iter().sum()
@@ -174,7 +174,7 @@ impl Checkpoints {
     /// Reads the newest checkpoint that is whole; `None` if there is none at all.
     pub fn load_newest(&mut self) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
         let latest = self.read(LATEST)?;
-        self.latest_is_sound = Some(matches!(latest, CheckpointFile::Whole(_)));
+        self.latest_is_whole = Some(matches!(latest, CheckpointFile::Whole(_)));
         let latest_path = self.directory.join(LATEST);
         let mut warnings = match latest {
             CheckpointFile::Whole(checkpoint) => {
@@ -250,16 +250,16 @@ impl Checkpoints {
     /// Frees the name `latest.ckpt`: a whole one becomes the previous one, a damaged one is renamed to an unused name.
     fn keep_latest(&mut self) -> Result<(), CheckpointError> {
         let latest = self.directory.join(LATEST);
-        let sound = match self.latest_is_sound {
-            Some(sound) => sound,
+        let is_whole = match self.latest_is_whole {
+            Some(is_whole) => is_whole,
             None => matches!(self.read(LATEST)?, CheckpointFile::Whole(_)),
         };
-        let kept = if sound {
+        let kept = if is_whole {
             self.directory.join(PREVIOUS)
         } else {
             self.unused_name()
         };
-        self.latest_is_sound = Some(false);
+        self.latest_is_whole = Some(false);
         match fs::rename(&latest, kept) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(CheckpointError::Write {
                 path: latest,
@@ -275,7 +275,7 @@ impl Checkpoints {
             path: self.directory.join(LATEST),
             source,
         })?;
-        self.latest_is_sound = Some(true);
+        self.latest_is_whole = Some(true);
         Ok(())
     }
 
@@ -320,7 +320,7 @@ impl Checkpoints {
     }
 }
 
-/// Whether this is the error of a broken disk or file system. Other reasons may pass, such as too many open files.
+/// Whether the error shows a damaged disk or file system. Others, such as too many open files, may be temporary.
 fn is_damage(error: &io::Error) -> bool {
     Errno::from_io_error(error).is_some_and(|errno| [Errno::IO, Errno::UCLEAN, Errno::BADMSG].contains(&errno))
 }

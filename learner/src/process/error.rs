@@ -40,13 +40,19 @@ pub enum LearnerError {
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
     /// A loss is not finite.
-    #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
+    #[error(
+        "learning has diverged: the losses are no longer finite after {updates} updates; lower the learning rates or \
+             reward.scale"
+    )]
     Diverged {
         /// Updates: gradient steps, or consumed rows (`TransitionUse`).
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.
-    #[error("{path}: some rows from row {needed} on are gone, and the checkpoint needs them again; start a new run")]
+    #[error(
+        "{path}: the checkpoint needs all rows from row {needed} on, and some of them are gone, probably after a power \
+             loss; start a new run"
+    )]
     RowsLost {
         /// The replay.
         path: PathBuf,

@@ -7,14 +7,11 @@ use shoal_common::role::Activity;
 
 use super::error::LearnerError;
 use super::evaluation_wait::EvaluationWait;
-use super::learner::{Learner, would_lose_rows};
+use super::learner::{CHUNKS_AT_ONCE, Learner, would_lose_rows};
 
 /// Updates between two publications of the policy. Publishing copies the policy's weights once, which takes about a
 /// thirtieth of an update's time.
 const PUBLISH_EVERY: u64 = 4;
-
-/// Chunks of each actor that are taken at most before the next update.
-const CHUNKS_AT_ONCE: u32 = 8;
 
 /// How long an idle learner sleeps before it refreshes its connections.
 const IDLE_WAIT: Duration = Duration::from_millis(50);
@@ -47,7 +44,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
 
         if updates < config.replay.allowed_updates(learner.env_steps) && !learner.replay.rows().is_empty() {
             learner.update()?;
-            // An update may count for several.
+            // One call may make several updates.
             if learner.updates() / PUBLISH_EVERY > updates / PUBLISH_EVERY {
                 learner.publish()?;
             }

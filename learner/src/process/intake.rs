@@ -6,7 +6,7 @@ use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
 use shoal_common::numbers::are_finite;
 use shoal_common::role::Role;
-use shoal_common::transition::ChunkLayout;
+use shoal_common::transition::{ChunkLayout, RowLayout};
 
 use crate::replay::{Appended, ChunkError, Replay};
 
@@ -25,12 +25,15 @@ pub enum IntakeError {
         cause: ChunkError,
     },
     /// A row holds a number that no environment or policy may give.
-    #[error("actor {actor} sent a row that cannot be learned from: its number {number} is {value}")]
+    #[error(
+        "actor {actor} sent a transition with {value} in {part}: the environment or the policy gave a number that is \
+             not finite"
+    )]
     NotFinite {
-        /// Who sent it.
+        /// The actor that sent it.
         actor: usize,
-        /// Which number of the row: of s, a, r, discount, s' and last, one after the other.
-        number: usize,
+        /// The part of the transition that has the number.
+        part: &'static str,
         /// The number.
         value: f32,
     },
@@ -40,13 +43,14 @@ pub enum IntakeError {
 #[derive(Debug)]
 pub struct Intake {
     actors: Vec<ActorChunks>,
-    /// Of the actors that share a service. They need no notification: the gate reads the commit record.
+    /// The receiver of the service that actors on joined hosts share. They need no notification, because the gate reads
+    /// the commit record.
     shared: Option<ChunkReceiver>,
     /// The actors that have sent through the shared service. The service gets a turn for each of them.
     sharing: BTreeSet<u32>,
     chunk: ChunkLayout,
     window: u32,
-    /// The number of rows beyond which none are taken.
+    /// The most rows that the replay may ever have committed; none are taken beyond it.
     limit: u64,
     /// The actor whose turn it is. Kept between calls: a learner that takes one chunk at a time must not take all of
     /// them from the first actor.
@@ -191,18 +195,22 @@ impl Intake {
 }
 
 fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usize) -> Result<Appended, IntakeError> {
+    let refused = |cause| IntakeError::Chunk { actor, cause };
+    let actors = replay.layout().actors;
+    if actor >= actors {
+        return Err(refused(ChunkError::Actor { actor, actors }));
+    }
     let rows = &chunk.rows()[..numbers];
     if !are_finite(rows) {
-        let width = replay.layout().row.width();
+        let layout = replay.layout().row;
         let bad = rows.iter().position(|number| !number.is_finite()).unwrap_or_default();
         return Err(IntakeError::NotFinite {
             actor,
-            number: bad % width,
+            part: part_of_row(layout, bad % layout.width()),
             value: rows[bad],
         });
     }
     let id = chunk.id(replay.committed(actor).last_chunk);
-    let refused = |cause| IntakeError::Chunk { actor, cause };
     let Some(reserved) = replay.begin(actor, id).map_err(refused)? else {
         return Ok(Appended::Duplicate);
     };
@@ -212,4 +220,93 @@ fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usi
         None => filled.commit(),
     }
     Ok(Appended::Accepted)
+}
+
+/// The part of a row that has this number, in words.
+fn part_of_row(layout: RowLayout, number: usize) -> &'static str {
+    let (observation, action) = (layout.observation_width(), layout.action_width());
+    let reward = observation + action;
+    match number {
+        n if n < observation => "the observation",
+        n if n < reward => "the action",
+        n if n == reward => "the reward",
+        n if n == reward + 1 => "the discount",
+        n if n < layout.width() - 1 => "the next observation",
+        _ => "the mark of the episode's end",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_common::channel::Services;
+    use shoal_common::channel::transitions::ChunkSender;
+    use shoal_common::transition::Transition;
+
+    use super::*;
+    use crate::replay::ReplayLayout;
+
+    #[test]
+    fn a_chunk_of_an_actor_that_the_replay_does_not_have_is_refused() {
+        let domain = Domain::join(&format!("intake{:x}", std::process::id()), 2).unwrap();
+        let mut services = Services::new(&domain).unwrap();
+        (0..2).for_each(|actor| services.create_actor(&domain, actor, 2).unwrap());
+        let chunk = ChunkLayout {
+            row: RowLayout::new(1, 1),
+            rows: 4,
+            actor_snapshot_words: 0,
+        };
+        let directory = tempfile::tempdir().unwrap();
+        let layout = ReplayLayout {
+            row: chunk.row,
+            ring: 10,
+            actors: 1,
+            actor_snapshot_words: 0,
+            fingerprint: 0,
+        };
+        let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
+        let intake = Intake::open(&domain, 2, 2, chunk, 100).unwrap();
+        let handshakes = [0, 1].map(|actor| ChunkSender::open(&domain, actor, 1, chunk, 2).unwrap());
+        assert_eq!(intake.take_from(0, &mut replay).unwrap(), Some(Appended::Accepted));
+        let refused = intake.take_from(1, &mut replay).unwrap_err();
+        assert!(
+            matches!(
+                refused,
+                IntakeError::Chunk {
+                    actor: 1,
+                    cause: ChunkError::Actor { actor: 1, actors: 1 }
+                }
+            ),
+            "{refused}"
+        );
+        drop((handshakes, intake, services));
+        domain.leave().unwrap();
+    }
+
+    #[test]
+    fn each_number_of_a_row_belongs_to_a_part_of_the_transition() {
+        let layout = RowLayout::new(2, 1);
+        let mut row = vec![0.0; layout.width()];
+        let transition = Transition {
+            s: &[1.0, 1.0],
+            a: &[2.0],
+            r: 3.0,
+            discount: 4.0,
+            s_next: &[5.0, 5.0],
+            last: true,
+        };
+        layout.write(&transition, &mut row);
+        let parts: Vec<&str> = (0..row.len()).map(|number| part_of_row(layout, number)).collect();
+        for (part, value) in [
+            ("the observation", 1.0),
+            ("the action", 2.0),
+            ("the reward", 3.0),
+            ("the discount", 4.0),
+            ("the next observation", 5.0),
+        ] {
+            let has_value: Vec<bool> = row.iter().map(|number| *number == value).collect();
+            let is_part: Vec<bool> = parts.iter().map(|found| *found == part).collect();
+            assert_eq!(&is_part[..row.len() - 1], &has_value[..row.len() - 1], "{part}");
+        }
+        assert_eq!(parts.last(), Some(&"the mark of the episode's end"));
+    }
 }

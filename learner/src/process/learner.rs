@@ -2,6 +2,7 @@
 
 use std::io;
 use std::ops::Range;
+use std::path::Path;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -23,12 +24,15 @@ use super::sizes::replay_layout;
 use crate::algorithms::algorithm::{Algorithm, Losses, SavedState};
 use crate::algorithms::registry;
 use crate::networks::threads::Threads;
-use crate::replay::{Replay, ReplayError, SyncedRows};
+use crate::replay::{Replay, ReplayError, ReplayLayout, SyncedRows};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 
 /// How often the learner looks for actors that it has no receiver for yet.
 const NEW_ACTORS_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Chunks of each actor that are taken at most before the next update or, at the end, before the time is checked.
+pub(crate) const CHUNKS_AT_ONCE: u32 = 8;
 
 /// At the end, the learner takes chunks until none has arrived for this long.
 const QUIET_TIME: Duration = Duration::from_millis(200);
@@ -104,45 +108,15 @@ impl<'a> Learner<'a> {
             algorithm.set_threads(Threads::two_threads()?);
         }
         let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
-        let (layout, file) = (replay_layout(config), run.replay_file());
-        let replay = match Replay::open(&file, &layout) {
-            Err(ReplayError::Missing(_)) => Replay::create(&file, &layout)?,
-            opened => opened?,
-        };
-        replay.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
-
+        let layout = replay_layout(config);
+        let replay = open_replay(&run.replay_file(), &layout)?;
         let mut checkpoints = Checkpoints::new(&run.checkpoints(), layout.fingerprint);
-        let counters = match checkpoints.load_newest()? {
-            None => Counters::default(),
-            Some(loaded) => {
-                loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
-                let counters = loaded.checkpoint.counters;
-                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.arrays))?;
-                tracing::info!(
-                    "continuing after {} updates and {} of {} rows",
-                    counters.updates,
-                    counters.rows,
-                    replay.head()
-                );
-                if replay.head() < counters.rows {
-                    tracing::warn!(
-                        "{} has {} rows, but the checkpoint was made with {}: the missing rows are collected again",
-                        file.display(),
-                        replay.head(),
-                        counters.rows
-                    );
-                }
-                Counters {
-                    episodes: remaining_episodes(&counters, &replay),
-                    ..counters
-                }
-            }
-        };
+        let counters = restore(&mut checkpoints, &mut *algorithm, &replay)?;
 
         let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
-        // The launcher compares what the learner begins with after failures.
+        // After a failure, the launcher compares the policy versions that successive learners begin with.
         heartbeat.set_policy_version(counters.policy_version);
-        let learner = Self {
+        let mut learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
             intake: open_intake(domain, config)?,
@@ -160,13 +134,11 @@ impl<'a> Learner<'a> {
             stop,
             listener,
             replay,
-            heartbeat: {
-                heartbeat.beat(Activity::WaitingForPeer);
-                heartbeat
-            },
+            heartbeat,
             algorithm,
             checkpoints,
         };
+        learner.heartbeat.beat(Activity::WaitingForPeer);
         learner.publish_current()?;
         Ok(learner)
     }
@@ -236,14 +208,14 @@ impl<'a> Learner<'a> {
         Ok(())
     }
 
-    /// Takes the chunks that the actors sent before the end, regardless of the ratio. A resumed run makes the updates
-    /// that they allow, except those without which rows would be lost.
+    /// Takes the chunks that the actors sent before the end, regardless of the ratio. Only updates without which rows
+    /// would be lost are made here. A resumed run makes the others.
     pub(crate) fn take_last_chunks(&mut self) -> Result<(), LearnerError> {
         let begun = Instant::now();
         let mut last_chunk_at = begun;
         while last_chunk_at.elapsed() < QUIET_TIME && begun.elapsed() < LAST_CHUNKS_TIMEOUT {
             let (config, updates) = (&self.settings.config, self.updates());
-            let took_any = self.intake.take_in_turn(&mut self.replay, u32::MAX, |replay| {
+            let took_any = self.intake.take_in_turn(&mut self.replay, CHUNKS_AT_ONCE, |replay| {
                 would_lose_rows(config, replay, updates)
             })?;
             self.advance_to(self.replay.head());
@@ -354,6 +326,48 @@ impl<'a> Learner<'a> {
     }
 }
 
+/// Opens the run's replay, or creates it if there is none.
+fn open_replay(file: &Path, layout: &ReplayLayout) -> Result<Replay, ReplayError> {
+    let replay = match Replay::open(file, layout) {
+        Err(ReplayError::Missing(_)) => Replay::create(file, layout)?,
+        opened => opened?,
+    };
+    replay.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
+    Ok(replay)
+}
+
+/// Restores the algorithm from the newest checkpoint, if there is one. Returns the learner's progress.
+fn restore(
+    checkpoints: &mut Checkpoints,
+    algorithm: &mut dyn Algorithm,
+    replay: &Replay,
+) -> Result<Counters, LearnerError> {
+    let Some(loaded) = checkpoints.load_newest()? else {
+        return Ok(Counters::default());
+    };
+    loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+    let counters = loaded.checkpoint.counters;
+    algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.arrays))?;
+    tracing::info!(
+        "continuing after {} updates and {} of {} rows",
+        counters.updates,
+        counters.rows,
+        replay.head()
+    );
+    if replay.head() < counters.rows {
+        tracing::warn!(
+            "{} has {} rows, but the checkpoint was made with {}: the missing rows are collected again",
+            replay.path().display(),
+            replay.head(),
+            counters.rows
+        );
+    }
+    Ok(Counters {
+        episodes: remaining_episodes(&counters, replay),
+        ..counters
+    })
+}
+
 /// Episodes of the checkpoint that end within the rows that the replay still has. A power loss can take the newest
 /// rows. Their replacements are counted when they arrive. If the ring has overwritten some of the run's own rows, the
 /// number is estimated.
@@ -396,7 +410,7 @@ mod tests {
     use shoal_common::transition::{RowLayout, Transition};
 
     use super::*;
-    use crate::replay::{ChunkId, ReplayLayout};
+    use crate::replay::ChunkId;
 
     /// A replay with this many initial rows, and rows of an actor in episodes of two.
     fn replay(initial: usize, rows: u64, ring: u64) -> (tempfile::TempDir, Replay) {

@@ -37,7 +37,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         for actor in 0..learner.intake.actor_count() {
             rows = await_chunk(learner, actor, rows)?;
         }
-        // Only after all chunks have come: a round that is interrupted before begins again.
+        // Only after all chunks have arrived, so that a round that is interrupted before that begins again.
         learner.advance_to(rows);
         while learner.updates() < replay_config.allowed_updates(learner.env_steps) {
             learner.update()?;
@@ -56,7 +56,8 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     Ok(())
 }
 
-/// Waits until the actor's chunk of this round is in the replay, which begins at row `first`; returns the row after it.
+/// Waits until the replay has the actor's chunk of this round, which begins at row `first`. Returns the row after the
+/// chunk.
 fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u64, Exit<LearnerError>> {
     loop {
         if let Some(end) = end_of_chunk(learner, actor, first) {

@@ -37,7 +37,7 @@ pub enum SizeError {
 }
 
 /// Bytes that the learner's files and the best policy need on the disk beyond those that the run in the directory `run`
-/// has already. A replay that exists is not counted, nor what a start that was killed has reserved for one.
+/// has already. A replay that exists does not count, nor does space that a killed start has already reserved for it.
 ///
 /// # Errors
 /// When the files would be too large.

@@ -18,9 +18,6 @@ use super::error::ReplayError;
 /// Creates an empty replay under a temporary name and renames it, so that a file with the replay's name is whole.
 pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOffsets), ReplayError> {
     let offsets = offsets(path, layout)?;
-    if fs::exists(path).map_err(io(path, "look for"))? {
-        return Err(ReplayError::Exists(path.into()));
-    }
     let temporary = temporary(path);
     let mut options = OpenOptions::new();
     // Truncated only under the lock, because another process may be creating it.
@@ -34,6 +31,10 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOf
     let file = file.map_err(io(path, "create"))?;
     lock(path, &file)?;
     let temporary = Temporary(temporary);
+    // After the lock: another process may have published this very file while this one waited.
+    if fs::exists(path).map_err(io(path, "look for"))? {
+        return Err(ReplayError::Exists(path.into()));
+    }
     file.set_len(0)
         .and_then(|()| file.set_permissions(Permissions::from_mode(0o600)))
         .map_err(io(path, "create"))?;
@@ -65,7 +66,7 @@ fn temporary(path: &Path) -> PathBuf {
     temporary.into()
 }
 
-/// Bytes of disk that a killed [`create`] has reserved for the file at `path`. The next one frees them first.
+/// Bytes of disk that a killed [`create`] has reserved for the file at `path`. The next `create` frees them first.
 pub(crate) fn unfinished_bytes(path: &Path) -> u64 {
     allocated_bytes(&temporary(path))
 }

@@ -135,9 +135,9 @@ impl Replay {
         self.ring.row(index)
     }
 
-    /// Row `index` if its numbers are all finite. Otherwise the next finite row of `within`, from its end continuing at
-    /// its beginning, or row `index` if there is none. Only rows of earlier versions can have other numbers: learners
-    /// now check chunks before they commit them.
+    /// Row `index` if its numbers are all finite. Otherwise the next finite row of `within`, continuing at its
+    /// beginning after its end; row `index` itself if there is none. Only replays of earlier versions can hold rows
+    /// that are not finite: a learner checks chunks before it commits them.
     ///
     /// # Panics
     /// As [`row`](Self::row).
@@ -163,13 +163,13 @@ impl Replay {
         others.find(|row| are_finite(row)).unwrap_or_else(|| self.row(index))
     }
 
-    /// The rows to draw a minibatch from, for a replay as it was after `logical_head` rows: the newest `capacity` rows
-    /// before it. There are fewer if the replay had fewer, if rows were lost, or if the ring has overwritten some
-    /// since. A caller that must rule out the last case compares the start with `logical_head - capacity`.
-    pub fn sampling_range(&self, logical_head: u64, capacity: u64) -> Range<u64> {
-        let rows = self.rows();
-        let end = logical_head.clamp(rows.start, rows.end);
-        end.saturating_sub(capacity).max(rows.start)..end
+    /// The rows to draw a minibatch from, for a replay as it was after `rows` rows: the newest `capacity` of them.
+    /// There are fewer if the replay had fewer, if rows were lost, or if the ring has overwritten some since. A caller
+    /// that must rule out the last case compares the start with `rows - capacity`.
+    pub fn sampling_range(&self, rows: u64, capacity: u64) -> Range<u64> {
+        let readable = self.rows();
+        let end = rows.clamp(readable.start, readable.end);
+        end.saturating_sub(capacity).max(readable.start)..end
     }
 
     /// Calls `hook` after each step of every later write, for crash tests.

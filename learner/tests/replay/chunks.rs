@@ -103,7 +103,7 @@ fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_the_rows_it_overwrot
 }
 
 #[test]
-fn a_window_is_the_newest_rows_before_its_head() {
+fn a_sampling_range_is_the_newest_rows_before_its_end() {
     let (directory, _) = filled(100, &[(0, 60), (1, 60)]);
     let replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     assert_eq!(replay.rows(), 20..120);

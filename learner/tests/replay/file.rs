@@ -2,9 +2,11 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
+use std::time::Duration;
 
 use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::file_lock;
 use shoal_common::transition::RowLayout;
 use shoal_learner::replay::{Replay, ReplayError, ReplayLayout};
 
@@ -161,4 +163,25 @@ fn a_replay_is_created_once_and_has_one_writer() {
     ));
     assert_eq!(directory.names(), ["replay.rows"]);
     assert_eq!(Replay::open(&path, &layout(10)).unwrap().rows(), 0..0);
+}
+
+#[test]
+fn a_replay_that_another_process_publishes_meanwhile_is_not_changed() {
+    let directory = Directory::new();
+    let path = directory.replay();
+    let unfinished = path.with_extension("rows.new");
+    fs::write(&unfinished, "another replay").unwrap();
+    let other = fs::File::open(&unfinished).unwrap();
+    assert!(file_lock::lock(&other, Duration::ZERO).unwrap());
+    std::thread::scope(|scope| {
+        let creating = scope.spawn(|| Replay::create(&path, &layout(10)).map(drop));
+        // Meanwhile it opens the unfinished file and waits for the lock.
+        std::thread::sleep(Duration::from_millis(200));
+        fs::rename(&unfinished, &path).unwrap();
+        drop(other);
+        let created = creating.join().unwrap();
+        assert!(matches!(created, Err(ReplayError::Exists(_))), "{created:?}");
+    });
+    assert_eq!(fs::read(&path).unwrap(), b"another replay");
+    assert_eq!(directory.names(), ["replay.rows"]);
 }

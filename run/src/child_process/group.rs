@@ -71,7 +71,7 @@ impl ChildGroup {
         self.ended
     }
 
-    /// Waits at most `timeout` for its end; its exit status, if it has ended.
+    /// Waits at most `timeout` for the process to end. Returns its exit status if it has ended.
     pub fn wait(&mut self, timeout: Duration) -> Option<ExitStatus> {
         let deadline = Instant::now() + timeout;
         loop {

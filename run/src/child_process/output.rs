@@ -34,9 +34,9 @@ pub enum Line<'a> {
     Kept(&'a str),
     /// A line beyond the rate. It is not for the log, unless it turns out to be one of the last before the program
     /// failed.
-    TooMuch(&'a str),
+    OverLimit(&'a str),
     /// The number of lines beyond the rate since the last kept line.
-    LeftOut(u64),
+    Omitted(u64),
 }
 
 /// The thread that reads a child's output.
@@ -136,7 +136,7 @@ impl Lines {
         }
         if self.source == OutputSource::Program && self.allowance < length {
             self.left_out += 1;
-            take(Line::TooMuch(&text));
+            take(Line::OverLimit(&text));
         } else {
             self.allowance -= length;
             self.report_left_out(take);
@@ -148,7 +148,7 @@ impl Lines {
 
     fn report_left_out(&mut self, take: &mut impl FnMut(Line<'_>)) {
         if self.left_out > 0 {
-            take(Line::LeftOut(self.left_out));
+            take(Line::Omitted(self.left_out));
             self.left_out = 0;
         }
     }
@@ -232,8 +232,8 @@ mod tests {
                     taken += 1;
                     last = text.to_owned();
                 }
-                Line::TooMuch(text) => last = text.to_owned(),
-                Line::LeftOut(count) => left_out += count,
+                Line::OverLimit(text) => last = text.to_owned(),
+                Line::Omitted(count) => left_out += count,
             };
             for i in 0..200_000 {
                 lines.add(format!("{i:099}\n").as_bytes(), now, &mut take);
@@ -257,7 +257,7 @@ mod tests {
     fn the_last_line_of_a_flood_is_passed_on() {
         let (mut lines, mut last) = (Lines::new(OutputSource::Program), String::new());
         let mut take = |line: Line<'_>| {
-            if let Line::TooMuch(text) = line {
+            if let Line::OverLimit(text) = line {
                 last = text.to_owned();
             }
         };

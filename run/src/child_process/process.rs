@@ -41,7 +41,7 @@ impl AsFd for ChildProcess {
 }
 
 impl ChildProcess {
-    /// Starts this program again as `role` 0 of the run.
+    /// Starts this program again as the process with index 0 of this role.
     pub fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
         let first = RoleInstance {
             role,
@@ -61,24 +61,24 @@ impl ChildProcess {
     /// Starts a process; messages name it `what`.
     pub fn start(command: &mut Command, what: String) -> std::io::Result<Self> {
         let (group, stdin, stderr) = ChildGroup::start(command)?;
-        let mut peer = Self {
+        let mut process = Self {
             group,
             stdin,
             output: None,
             last_line: Arc::default(),
             what,
         };
-        let last_line = Arc::clone(&peer.last_line);
+        let last_line = Arc::clone(&process.last_line);
         let keep = move |line: Line<'_>| match line {
-            Line::Kept(text) | Line::TooMuch(text) if !text.trim().is_empty() => {
+            Line::Kept(text) | Line::OverLimit(text) if !text.trim().is_empty() => {
                 *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(text.trim().into());
             }
             _ => {}
         };
-        peer.output = stderr
-            .map(|stderr| ChildOutput::read("peer", stderr, OutputSource::Program, keep))
+        process.output = stderr
+            .map(|stderr| ChildOutput::read("child output", stderr, OutputSource::Program, keep))
             .transpose()?;
-        Ok(peer)
+        Ok(process)
     }
 
     /// Its process id.
@@ -145,7 +145,7 @@ impl ChildProcess {
         }
     }
 
-    /// Waits at most `timeout` for its end; its exit status, if it has ended.
+    /// Waits at most `timeout` for the process to end. Returns its exit status if it has ended.
     pub fn wait(&mut self, timeout: Duration) -> Option<ExitStatus> {
         self.group.wait(timeout)
     }

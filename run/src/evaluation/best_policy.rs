@@ -3,6 +3,7 @@
 
 use anyhow::Context;
 use shoal_common::config::Config;
+use shoal_common::numbers::are_finite;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::{LockedRun, RunDir};
 
@@ -62,13 +63,7 @@ pub fn evaluate_and_keep_best(
     // The episodes may have taken long: by now another run may be at its place.
     run.check()?;
     if kept.policy == SavedPolicy::Last {
-        let best = PolicyFile {
-            return_mean: kept.summary.return_mean,
-            return_std: kept.summary.return_std,
-            episodes: kept.summary.episodes.into(),
-            ..kept.file.clone()
-        };
-        best.write(&run.best_policy())?;
+        kept.summary.of_policy(&kept.file).write(&run.best_policy())?;
     }
     let entry = |it: &Candidate| FinalPolicyResult::new(it.policy, (it.file.version, it.file.env_steps), &it.summary);
     let result = FinalEvaluation::new(seed, env_steps, candidates.iter().map(entry).collect(), kept.policy);
@@ -114,7 +109,7 @@ pub fn ensure_best_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
 }
 
 fn is_finite(file: &PolicyFile) -> bool {
-    file.parameters.iter().all(|parameter| parameter.is_finite())
+    are_finite(&file.parameters)
 }
 
 #[cfg(test)]

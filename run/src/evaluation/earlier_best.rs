@@ -1,7 +1,6 @@
-//! Evaluates the best policy of a run again if its successors are evaluated in another way than it was.
+//! Evaluates the best policy of a run again if later policies are evaluated differently.
 
 use shoal_common::config::Config;
-use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::LockedRun;
 
 use crate::evaluation::{EpisodeSet, EvaluationSummary, SavedPolicy, evaluate_policy};
@@ -20,8 +19,8 @@ pub struct ReevaluatedPolicy {
 }
 
 /// Evaluates the best policy of a Gymnasium run of an earlier version again, once. In that version the seeds of
-/// episodes could be above 2³¹, so half of the starts differ from today's. By luck alone, the policy may have looked
-/// better or worse.
+/// episodes could be above 2³¹, so half of its start states differ from those of later evaluations, and the returns
+/// cannot be compared.
 ///
 /// Such a run has no `server.json`, which came with the same version as the new seeds. This function writes that file,
 /// so the next call finds nothing to do.
@@ -63,15 +62,9 @@ pub fn reevaluate_best(
         seed: config.run.seed,
     };
     let now = evaluate_policy(run, config, &best.parameters, episodes, interrupt, |_| ())?;
-    let updated = PolicyFile {
-        return_mean: now.return_mean,
-        return_std: now.return_std,
-        episodes: now.episodes.into(),
-        ..best.clone()
-    };
     // The episodes may have taken long: by now another run may be at its place.
     run.check()?;
-    updated.write(&run.best_policy())?;
+    now.of_policy(&best).write(&run.best_policy())?;
     Ok(Some(ReevaluatedPolicy {
         before: best.return_mean,
         now,

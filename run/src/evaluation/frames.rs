@@ -1,4 +1,4 @@
-//! What is seen of an episode: pictures of its states.
+//! Pictures of an episode's states.
 
 use shoal_env_server::frame::{Frame, Written};
 

@@ -17,7 +17,7 @@ use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::LaunchContext;
 use crate::signals::{Interrupt, describe};
 
-/// How often an episode is begun if the environment's server fails in it, each time with a new server.
+/// How many times an episode is tried if the environment's server fails, each time with a new server.
 const TRIES: u32 = 5;
 
 /// An episode of T steps.
@@ -132,11 +132,11 @@ impl<'a> Rollout<'a> {
             .map(|(trajectory, _)| trajectory)
     }
 
-    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures of it, or the reason why
-    /// there are none: a sentence without its full stop. The rollout must be made with
-    /// [`with_pictures`](Self::with_pictures) if another program serves the environment. An episode that may have more
-    /// steps is played twice: its length decides which states are drawn, because drawing takes much longer than
-    /// stepping. Calls `progress` with the number of steps.
+    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures. If there are none,
+    /// returns the reason: a sentence without its full stop. If another program serves the environment, the rollout
+    /// must have been made with [`with_pictures`](Self::with_pictures). Drawing takes much longer than stepping, so a
+    /// long episode is played twice: first to find its length, then to draw evenly spaced states. Calls `progress` with
+    /// the number of steps.
     pub fn filmed_episode(
         &mut self,
         (seed, number): (u64, u64),

@@ -2,7 +2,7 @@
 
 use anyhow::bail;
 use serde::de::DeserializeOwned;
-use shoal_common::config::{AlgorithmConfig, EnvironmentConfig, Mode, RunConfig};
+use shoal_common::config::{AlgorithmConfig, EnvironmentConfig, RunConfig};
 use shoal_common::section;
 use shoal_env_server::description::Description;
 use shoal_env_server::environment::{self, EnvironmentError};
@@ -18,15 +18,13 @@ use crate::signals::Interrupt;
 
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
 /// environment the settings of a suitable algorithm if the configuration names none. Returns what another program that
-/// serves the environment says of it.
-pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<Description>> {
+/// serves the environment says of it. A signal ends the wait for that program.
+pub(super) fn describe_environment(table: &mut Table, interrupt: Interrupt) -> anyhow::Result<Option<Description>> {
     let run = table.get("run");
-    let mode = run.and_then(|run| run.get("mode")).and_then(Value::as_str);
-    let mode = if mode == Some("lockstep") {
-        Mode::Lockstep
-    } else {
-        Mode::Free
-    };
+    let mode = run
+        .and_then(|run| run.get("mode"))
+        .and_then(|mode| mode.clone().try_into().ok())
+        .unwrap_or(RunConfig::default().mode);
     let seed = run.and_then(|run| run.get("seed")).and_then(Value::as_integer);
     let seed = seed.map_or(RunConfig::default().seed, i64::cast_unsigned);
     let Some(Value::Table(section)) = table.get_mut("environment") else {
@@ -53,7 +51,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<D
             hash_seed: hash_seed(mode, seed),
             picture_height: None,
         };
-        let served = ExternalEnvironment::begin_in(&environment, 1, 0, launch_context, Interrupt::default())?;
+        let served = ExternalEnvironment::begin_in(&environment, 1, 0, launch_context, interrupt)?;
         (environment, served.spec().clone(), served.description()?)
     } else {
         let parameters = environment::resolve(&name, section)?;

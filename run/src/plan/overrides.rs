@@ -48,7 +48,7 @@ pub struct RunOverrides {
     /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub set: Vec<String>,
-    /// Begin with the networks of this run, whose algorithm and shapes it then has.
+    /// Begin with the networks of this run, and take over its algorithm and the shapes of its networks.
     #[arg(long, value_name = "RUN")]
     pub from: Option<PathBuf>,
     /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
@@ -218,7 +218,7 @@ fn did_you_mean(key: &str, table: &Table) -> String {
     }
 }
 
-/// Makes whole numbers of `1e5` and `30k` where a key takes whole numbers.
+/// Replaces numbers such as `1e5` and `30k` by whole numbers, for keys that take whole numbers.
 pub(super) fn read_counts(table: &mut Table) -> Result<(), UsageError> {
     let mut keys: Vec<(&str, Key)> = Vec::new();
     for section in explanation::sections() {

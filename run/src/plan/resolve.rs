@@ -15,6 +15,7 @@ use super::sections::sections_for_algorithm;
 use super::source::{SettingSource, SettingSources};
 use super::table::{integer, put};
 use crate::origin::{Origin, shapes};
+use crate::signals::Interrupt;
 use crate::usage::UsageError;
 
 /// The resolved configuration of a preset or a file, without overrides.
@@ -24,13 +25,22 @@ pub fn resolve_preset(what: &str) -> anyhow::Result<Config> {
 
 /// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
 pub fn resolve_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
-    let resolved = resolve_all(what, overrides)?;
+    let resolved = resolve_all(what, overrides, Interrupt::default())?;
     Ok((resolved.config, resolved.sources))
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn resolve(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let resolved = resolve_all(what, overrides)?;
+    resolve_interruptibly(what, overrides, Interrupt::default())
+}
+
+/// As [`resolve`], but a signal ends the wait for another program that serves the environment.
+pub(crate) fn resolve_interruptibly(
+    what: &str,
+    overrides: &RunOverrides,
+    interrupt: Interrupt,
+) -> anyhow::Result<(String, Config)> {
+    let resolved = resolve_all(what, overrides, interrupt)?;
     Ok((resolved.name, resolved.config))
 }
 
@@ -44,8 +54,9 @@ pub(super) struct Resolved {
     pub(super) description: Option<Description>,
 }
 
-/// Resolves a preset or a file with these overrides. Creates nothing.
-pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Result<Resolved> {
+/// Resolves a preset or a file with these overrides. Creates nothing. A signal ends the wait for another program that
+/// serves the environment.
+pub(super) fn resolve_all(what: &str, overrides: &RunOverrides, interrupt: Interrupt) -> anyhow::Result<Resolved> {
     let (name, mut table, mut sources) = sections_for_algorithm(what, overrides)?;
     set_options(&mut table, &mut sources, overrides)?;
     for assignment in &overrides.set {
@@ -85,7 +96,8 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Resul
     let format = i64::from(u32::from(IdentityFormat::NEWEST));
     put(&mut table, &["run", "identity_format"], format.into())?;
     let chosen = table.clone();
-    let description = describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
+    let description =
+        describe_environment(&mut table, interrupt).map_err(|error| about_environment(error, &sources))?;
     // That has added an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;

@@ -226,8 +226,7 @@ fn with_actors(text: &str, actors: u32) -> Option<String> {
     found.then_some(with)
 }
 
-/// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the
-/// run was last used with.
+/// What `config.toml` will change at the next resume of a run that is not running, in words; `None` if nothing.
 pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
     match Revision::new(run, used, &RequestedChanges::default()) {
         Err(error) => Some(format!("it cannot be resumed: {error:#}")),
@@ -300,8 +299,8 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
             })
             .collect();
         bail!(
-            "{}: cannot change in this run: an early version of the program made it, whose files are identified by \
-             such keys",
+            "{}: cannot change in this run: it was made by an early version of the program, which identified its files \
+             by these keys",
             names.join(", ")
         );
     }
@@ -309,9 +308,14 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     if may_have_replay && replay_layout(config) != replay_layout(used) {
         bail!("{names}: cannot change in this run: its replay.bin was made for other sizes");
     }
-    if used.run.mode == Mode::Free {
-        return Ok(());
+    match used.run.mode {
+        Mode::Free => Ok(()),
+        Mode::Lockstep => check_round(run, used, config, differences),
     }
+}
+
+/// Checks that a lockstep run can begin with the configuration at a definite round.
+fn check_round(run: &RunDir, used: &Config, config: &Config, differences: &[Difference]) -> anyhow::Result<()> {
     let saved = saved_status(used, run)?;
     let here = run.path().display();
     let learning = differences.iter().find(|it| it.change == Change::Learning);
@@ -326,7 +330,7 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     }
     if saved.replay_rows > saved.env_steps && config.run.steps < saved.replay_rows {
         bail!(
-            "run.steps = {}: must be at least {} now, because the replay of this lockstep run has so many steps already",
+            "run.steps = {}: must be at least {}, because the replay of this lockstep run already has that many steps",
             config.run.steps,
             saved.replay_rows
         );

@@ -14,7 +14,7 @@ use crate::signals::describe;
 pub struct RunOutcome {
     /// The run's state.
     pub state: RunState,
-    /// Why it has no roles, if it is running, or why it did not finish.
+    /// Why a running run has no roles; why another one did not finish, or has no final evaluation.
     pub reason: Option<OutcomeReason>,
     /// Environment steps that were learned from.
     pub steps: u64,

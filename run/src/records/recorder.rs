@@ -124,8 +124,15 @@ pub struct Recorder {
     flushed_at: Instant,
 }
 
-/// Records the final evaluation for TensorBoard, as scalars named `final/…`.
-pub fn record_final(run: &RunDir, evaluation: &FinalEvaluation) -> Result<(), RecordError> {
+/// Records the final evaluation of a run with `env_steps` environment steps for TensorBoard, as scalars named
+/// `final/…`.
+///
+/// # Errors
+/// When the evaluation cannot be read, or the record cannot be written.
+pub fn record_final(run: &RunDir, env_steps: u64) -> anyhow::Result<()> {
+    let Some(evaluation) = FinalEvaluation::read(run, env_steps)? else {
+        return Ok(());
+    };
     let write = || {
         let mut events = EventFile::create(&run.tensorboard(), None)?;
         for policy in &evaluation.policies {
@@ -141,10 +148,8 @@ pub fn record_final(run: &RunDir, evaluation: &FinalEvaluation) -> Result<(), Re
         events.finished()?;
         events.flush()
     };
-    write().map_err(|cause| RecordError::Write {
-        path: run.tensorboard(),
-        cause,
-    })
+    let path = run.tensorboard();
+    Ok(write().map_err(|cause| RecordError::Write { path, cause })?)
 }
 
 impl Recorder {
@@ -168,8 +173,8 @@ impl Recorder {
             episode_steps = episode_steps.max(row.env_steps);
         })?;
         let newest = env_steps.max(episode_steps).max(evaluated.unwrap_or(0));
-        let continues = (!learned.is_empty()).then_some(newest.saturating_add(1));
-        let events = EventFile::create(&run.tensorboard(), continues).map_err(|cause| RecordError::Write {
+        let first_step = (!learned.is_empty()).then_some(newest.saturating_add(1));
+        let events = EventFile::create(&run.tensorboard(), first_step).map_err(|cause| RecordError::Write {
             path: run.tensorboard(),
             cause,
         })?;
@@ -190,7 +195,7 @@ impl Recorder {
             previous: None,
             flushed_at: flushed,
         };
-        if continues.is_some() {
+        if first_step.is_some() {
             let resumed = Incident::of_launcher(IncidentKind::Resumed, String::new());
             recorder.incident(&resumed, Duration::ZERO)?;
         }

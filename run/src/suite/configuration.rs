@@ -81,7 +81,7 @@ fn check_first_round(suite: &Suite, config: &Config) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What all runs and this one of the suite override.
+/// The overrides of this run: those of all runs of the suite, and its own.
 pub(super) fn overrides_of(suite: &Suite, trial: &Trial) -> anyhow::Result<RunOverrides> {
     let common = RunOverrides::from_arguments(&suite.arguments)?;
     let set = common.set.iter().chain(&trial.set).chain(&suite.changes);

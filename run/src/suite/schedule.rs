@@ -6,7 +6,7 @@ use std::process::Command;
 use std::sync::mpsc::Sender;
 
 use anyhow::bail;
-use shoal_common::message::one_line;
+use shoal_common::message::{one_line, say};
 use shoal_common::run_dir::RunDir;
 use signal_hook::consts::SIGTERM;
 
@@ -15,7 +15,6 @@ use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
 use crate::child_process::tied;
 use crate::evaluation::best_policy::evaluate_and_keep_best;
-use crate::evaluation::final_evaluation::FinalEvaluation;
 use crate::files::is_there;
 use crate::interrupted_start::remove_interrupted_start;
 use crate::jobs::{TrainingEnd, run_jobs, run_training, trainings_for_all_cores};
@@ -41,7 +40,7 @@ pub enum Event {
     Failed(usize, String),
 }
 
-/// Is told how the training of a suite goes.
+/// Receives the progress of a suite's training.
 pub trait Observer {
     /// The runs of the trials with the numbers `due` are trained from now on, in this order; in a round of halving each
     /// until it has done the share `until` of its steps.
@@ -78,7 +77,7 @@ pub fn train(
         };
         // A run that failed gets a second chance before it counts as worse: disk or memory may have been full.
         for chance in 0..2 {
-            let due = Due::new(suite, directory, is_due, jobs)?;
+            let due = Due::new(suite, directory, is_due, jobs, signals)?;
             if signals.received().is_some() || (chance > 0 && due.numbers.is_empty()) {
                 break;
             }
@@ -90,7 +89,10 @@ pub fn train(
         let result = |trial: &Trial| best_return(&directory.join(&trial.name));
         if !round.trials.iter().any(|trial| result(trial).is_finite()) {
             let (here, percent) = (directory.display(), 100.0 * round.share);
-            bail!("no run of {here} was evaluated in the first {percent:.0} % of its steps, so none can be preferred");
+            bail!(
+                "no run of {here} was evaluated in the first {percent:.0} % of its steps, so none can be preferred; \
+                 lower evaluation.every with `shoal resume {here} --set evaluation.every=N`, or give the runs more steps"
+            );
         }
         let ended = suite.end_worse_half(result);
         suite.write(directory)?;
@@ -101,7 +103,7 @@ pub fn train(
             let run = directory.join(&trial.name);
             Ok(!suite.was_ended_early(trial) && (!check_finished(suite, &run)? || lacks_evaluation(&run)?))
         };
-        Due::new(suite, directory, is_due, jobs)?.train(signals, None, observer, &mut failed);
+        Due::new(suite, directory, is_due, jobs, signals)?.train(signals, None, observer, &mut failed);
     }
     failed.retain(|number| !suite.was_ended_early(&suite.trials[*number]));
     Ok(failed.len())
@@ -121,6 +123,7 @@ impl<'a> Due<'a> {
         directory: &'a Path,
         is_due: impl Fn(&Trial) -> anyhow::Result<bool>,
         jobs: Option<u16>,
+        signals: &Signals,
     ) -> anyhow::Result<Self> {
         let mut numbers = VecDeque::new();
         for (number, trial) in suite.trials.iter().enumerate() {
@@ -134,7 +137,7 @@ impl<'a> Due<'a> {
             _ if one_at_a_time => 1,
             (Some(jobs), _) => jobs.into(),
             (None, None) => 1,
-            (None, Some(first)) => usual_jobs(suite, directory, *first)?,
+            (None, Some(first)) => usual_jobs(suite, directory, *first, signals)?,
         };
         Ok(Self {
             suite,
@@ -182,13 +185,14 @@ impl<'a> Due<'a> {
 }
 
 /// The number of runs at a time that cores and shared memory allow.
-fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<usize> {
+fn usual_jobs(suite: &Suite, directory: &Path, first: usize, signals: &Signals) -> anyhow::Result<usize> {
     let trial = &suite.trials[first];
     let overrides = overrides_of(suite, trial)?;
     let stored = RunDir::open(&directory.join(&trial.name))
         .ok()
         .and_then(|run| run.config().ok());
-    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides).ok()?.1));
+    let resolve = || plan::resolve_interruptibly(&suite.what, &overrides, signals.interrupt());
+    let config = stored.or_else(|| Some(resolve().ok()?.1));
     // If this fails: one. Each run checks for itself what it needs.
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
@@ -223,7 +227,7 @@ fn lacks_evaluation(run: &Path) -> anyhow::Result<bool> {
     Ok(matches!(reason, Some(OutcomeReason::EvaluationEnded(_))))
 }
 
-/// Makes the final evaluation that [`lacks_evaluation`] misses.
+/// Makes the missing final evaluation of a finished run.
 fn evaluate(run: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
     let run = RunDir::open(run)?.lock()?;
     let config = run.config()?;
@@ -238,8 +242,9 @@ fn evaluate(run: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
     let finished = outcome(RunState::Finished);
     let Err(error) = evaluated else {
         finished.write(&run)?;
-        let result = FinalEvaluation::read(&run, saved.env_steps)?;
-        result.map_or(Ok(()), |result| record_final(&run, &result))?;
+        if let Err(error) = record_final(&run, saved.env_steps) {
+            say(format!("the final evaluation is not in TensorBoard's records: {error}"));
+        }
         return Ok(TrainingEnd::Finished);
     };
     let signal = interrupt.signal();

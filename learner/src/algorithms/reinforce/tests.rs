@@ -178,9 +178,9 @@ fn the_gradient_is_that_of_the_objective() {
             let returns = episode.returns();
             let n = returns.len() as f64;
             let mean = returns.iter().sum::<f64>() / n;
-            let spread = (returns.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / n).sqrt();
+            let std = (returns.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / n).sqrt();
             let weight_of = |(t, g): (usize, &f64)| match weight {
-                ReturnWeighting::Normalised => (g - mean) / spread,
+                ReturnWeighting::Normalised => (g - mean) / std,
                 _ if discount_steps => 0.9_f64.powi(t as i32) * g,
                 _ => *g,
             };

@@ -29,7 +29,7 @@ fn table(bootstrap: Bootstrap, alpha: f64) -> Tabular {
 /// s, a, r, discount, s', last
 type Row = (usize, usize, f32, f32, usize, bool);
 
-fn teach(table: &mut Tabular, slot: usize, (s, a, r, discount, s_next, last): Row) {
+fn teach(table: &mut Tabular, environment: usize, (s, a, r, discount, s_next, last): Row) {
     let transition = Transition {
         s: &[s as f32],
         a: &[a as f32],
@@ -38,7 +38,7 @@ fn teach(table: &mut Tabular, slot: usize, (s, a, r, discount, s_next, last): Ro
         s_next: &[s_next as f32],
         last,
     };
-    table.learn(&transition, slot);
+    table.learn(&transition, environment);
 }
 
 #[test]
@@ -80,8 +80,8 @@ fn sarsa_uses_the_next_action_of_the_same_environment() {
 fn the_number_of_a_row_determines_its_environment() {
     // Two actors with two environments each, two steps a chunk.
     let table = table(Bootstrap::NextAction, 0.5);
-    let slots: Vec<usize> = (0..12).map(|row| table.slot(row)).collect();
-    assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3, 0, 1, 0, 1]);
+    let environments: Vec<usize> = (0..12).map(|row| table.environment(row)).collect();
+    assert_eq!(environments, [0, 1, 0, 1, 2, 3, 2, 3, 0, 1, 0, 1]);
 }
 
 #[test]
@@ -114,15 +114,19 @@ fn after_a_round_that_was_cut_off_the_next_row_begins_a_new_one() {
     // A round has 8 rows: two actors with two environments each, two steps a chunk.
     let mut new = table(Bootstrap::NextAction, 0.5);
     new.restore(13, &mut saved(&old)).unwrap();
-    let slots: Vec<usize> = (13..21).map(|row| new.slot(row)).collect();
-    assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3]);
+    let environments: Vec<usize> = (13..21).map(|row| new.environment(row)).collect();
+    assert_eq!(environments, [0, 1, 0, 1, 2, 3, 2, 3]);
     assert!(new.pending.iter().all(|number| *number == 0.0));
     new.pending = waiting.clone();
     let mut newer = table(Bootstrap::NextAction, 0.5);
     newer.restore(29, &mut saved(&new)).unwrap();
-    assert_eq!((newer.slot(29), &newer.pending), (0, &waiting), "after whole rounds");
+    assert_eq!(
+        (newer.environment(29), &newer.pending),
+        (0, &waiting),
+        "after whole rounds"
+    );
     newer.restore(31, &mut saved(&new)).unwrap();
-    assert_eq!(newer.slot(31), 0, "after another one that was cut off");
+    assert_eq!(newer.environment(31), 0, "after another one that was cut off");
 }
 
 #[test]

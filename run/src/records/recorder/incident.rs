@@ -14,7 +14,7 @@ pub enum IncidentKind {
     Failed,
     /// The process made no progress and was killed to be replaced.
     Stalled,
-    /// An environment of it returned something invalid; its episodes were given up.
+    /// An environment of the process returned something invalid, and its episodes were given up.
     Fault,
     /// The role's process was restarted.
     #[serde(rename = "started-again")]

@@ -138,9 +138,9 @@ pub(crate) struct EventFile {
 
 impl EventFile {
     /// Creates a new file in `directory`, and the directory if necessary. TensorBoard reads all files there as one run.
-    /// The file of a resumed run begins at step `continues`: later ones in earlier files, which the run's tables do not
-    /// have, are not shown.
-    pub(crate) fn create(directory: &Path, continues: Option<u64>) -> io::Result<Self> {
+    /// The file of a resumed run begins at step `first_step`. TensorBoard then hides this step and later ones in
+    /// earlier files; the run's tables do not have them either.
+    pub(crate) fn create(directory: &Path, first_step: Option<u64>) -> io::Result<Self> {
         std::fs::create_dir_all(directory)?;
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         // TensorBoard reads the files in the order of their names.
@@ -157,7 +157,7 @@ impl EventFile {
             file_version: Some("brain.Event:2".into()),
             ..Event::default()
         })?;
-        if let Some(step) = continues {
+        if let Some(step) = first_step {
             events.write(&Event {
                 step: step as i64,
                 session_log: Some(SessionLog { status: START }),
