@@ -35,7 +35,7 @@ NO_ARGUMENTS = {"name", "server", "faults", "start_seconds", "parameters"}
 
 @contextlib.contextmanager
 def using_minari() -> Iterator[Any]:
-    """Minari's package, without its advice about what a dataset could also have. Its errors are one line here."""
+    """Minari's package with its warnings silenced. Its exceptions become a :class:`ShoalError` of one line."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -69,7 +69,7 @@ def to_minari(
         check_id(dataset_id)
         if minari.storage.get_dataset_path(dataset_id).exists():
             raise ShoalError(f"{dataset_id} exists already: choose another version, or `minari delete {dataset_id}`")
-        if not found.places:
+        if not found.indices:
             raise ShoalError(f"{run.path} has no transitions of its own to export")
         environment = environment_of(config)
         spaces = {
@@ -79,7 +79,7 @@ def to_minari(
         try:
             return minari.create_dataset_from_buffers(
                 dataset_id,
-                [buffer(found.batch, places, spaces) for places in found.places],
+                [buffer(found.batch, indices, spaces) for indices in found.indices],
                 env=environment.spec if environment else None,
                 algorithm_name=f"Shoal {next(name for name in ALGORITHMS if name in config)}",
                 author=author,
@@ -142,16 +142,16 @@ def elements(lines: np.ndarray, space: gymnasium.Space[Any]) -> np.ndarray:
     return lines.reshape(len(lines), *space.shape)
 
 
-def buffer(batch: Batch, places: np.ndarray, spaces: Mapping[str, gymnasium.Space[Any]]) -> Any:
+def buffer(batch: Batch, indices: np.ndarray, spaces: Mapping[str, gymnasium.Space[Any]]) -> Any:
     """An episode as Minari takes it."""
     from minari.data_collector import EpisodeBuffer
 
-    observations = np.concatenate([batch.observation[places], batch.next_observation[places[-1:]]])
-    last, terminated = batch.last[places], batch.discount[places] == 0
+    observations = np.concatenate([batch.observation[indices], batch.next_observation[indices[-1:]]])
+    last, terminated = batch.last[indices], batch.discount[indices] == 0
     return EpisodeBuffer(
         observations=elements(observations, spaces["observation"]),
-        actions=elements(batch.action[places], spaces["action"]),
-        rewards=batch.reward[places],
+        actions=elements(batch.action[indices], spaces["action"]),
+        rewards=batch.reward[indices],
         terminations=terminated,
         truncations=last & ~terminated,
     )
@@ -161,8 +161,8 @@ def described(run: Run, found: episodes.Episodes) -> str:
     """What a reader of the dataset should know."""
     environment = run.config["environment"]["name"]
     text = f"The replay of the run {run.path.name} of Shoal in the environment {environment}."
-    if found.begun_with:
-        text += f" Left out: {found.begun_with} rows with which the run began."
+    if found.initial_rows:
+        text += f" Left out: {found.initial_rows} rows with which the run began."
     if found.overwritten:
         text += f" Its first {found.overwritten} rows were overwritten: the episodes under way then begin later."
     return text

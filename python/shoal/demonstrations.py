@@ -9,7 +9,6 @@ and its own γ. ``run/src/demonstrations.rs`` reads it.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import zlib
@@ -20,6 +19,7 @@ import numpy as np
 
 from .datasets import using_minari
 from .errors import ShoalError
+from .program import toml_string
 
 if TYPE_CHECKING:
     import gymnasium
@@ -43,13 +43,13 @@ def load(dataset: str) -> tuple[str, np.ndarray]:
         raise ShoalError(f"{dataset} has no episodes")
     lines = np.concatenate(episodes)
     header = [
-        f"dataset = {json.dumps(found.spec.dataset_id)}",
+        f"dataset = {toml_string(found.spec.dataset_id)}",
         f"episodes = {len(episodes)}",
         f"rows = {len(lines)}",
         *(f"{which} = {space.toml()}" for which, space in spaces.items()),
     ]
     if environment is not None:
-        header.append(f"environment = {json.dumps(environment)}")
+        header.append(f"environment = {toml_string(environment)}")
     return "\n".join(header) + "\n", lines
 
 

@@ -22,15 +22,15 @@ class Episodes:
 
     Attributes:
         batch: the rows.
-        places: for each episode the places of its rows in ``batch``, in their order. Episodes are in the order of their
-            first rows. One without a row that is ``last`` was cut: it is under way, or its process was replaced.
-        begun_with: rows of another run, or of a dataset, that are in the replay too. They are left out.
+        indices: for each episode the indices of its rows in ``batch``, in their order. Episodes are in the order of
+            their first rows. One without a row that is ``last`` was cut: it is under way, or its process was replaced.
+        initial_rows: rows of another run, or of a dataset, that are in the replay too. They are left out.
         overwritten: rows of this run that the ring no longer has. The episodes that they began begin later here.
     """
 
     batch: Batch
-    places: list[np.ndarray]
-    begun_with: int
+    indices: list[np.ndarray]
+    initial_rows: int
     overwritten: int
 
 
@@ -39,7 +39,10 @@ class Ambiguous(Exception):
 
 
 def episodes(run: Run) -> Episodes:
-    """The episodes in the run's replay, exactly as they were. The run may continue.
+    """The episodes in the run's replay. The run may continue.
+
+    An episode that was cut, and one that begins at exactly the observation at which it was cut, are taken for one:
+    rows do not say where a process was replaced.
 
     Raises :class:`ShoalError` where the rows do not say what belongs together: with ``replay.n_step`` above 1, with a γ
     of 0, and where two environments were at the same observation.
@@ -48,9 +51,9 @@ def episodes(run: Run) -> Episodes:
     check(config)
     transitions = run.transitions()
     batch = transitions.copy()
-    begun_with, actors = transitions.written()
-    oldest = int(batch.row[0]) if len(batch) else begun_with
-    own = batch[max(begun_with - oldest, 0) :]
+    initial_rows, actors = transitions.written()
+    oldest = int(batch.row[0]) if len(batch) else initial_rows
+    own = batch[max(initial_rows - oldest, 0) :]
     envs = int(config["actors"]["envs"])
     try:
         alone = actors <= 1 and envs == 1 and not had_other_envs(run)
@@ -60,7 +63,7 @@ def episodes(run: Run) -> Episodes:
             f"actors.envs = {envs} and {actors} actors: their episodes cannot be told apart, because {what}; collect "
             "with --actors 1 --envs 1"
         ) from None
-    return Episodes(own, group_by_episode(own, before), len(batch) - len(own), max(oldest - begun_with, 0))
+    return Episodes(own, group_by_episode(own, before), len(batch) - len(own), max(oldest - initial_rows, 0))
 
 
 def check(config: Mapping[str, Any]) -> None:
@@ -89,7 +92,7 @@ def words(lines: np.ndarray) -> list[bytes]:
 
 
 def rows_before(batch: Batch) -> np.ndarray:
-    """For each row the place of the row whose episode it continues, or -1.
+    """For each row the index of the row whose episode it continues, or -1.
 
     Rows of several actors and environments are interleaved, and do not say whose they are. A row continues the episode
     that is under way and whose s' has the bits of its s. Raises :class:`Ambiguous` if another one has them too, or
@@ -98,11 +101,11 @@ def rows_before(batch: Batch) -> np.ndarray:
     observations, following = words(batch.observation), words(batch.next_observation)
     before = np.full(len(batch), -1)
     under_way: dict[bytes, int] = {}
-    for place, (here, there, last) in enumerate(zip(observations, following, batch.last.tolist())):
-        before[place] = under_way.pop(here, -1)
-        if not last and under_way.setdefault(there, place) != place:
+    for index, (here, there, last) in enumerate(zip(observations, following, batch.last.tolist())):
+        before[index] = under_way.pop(here, -1)
+        if not last and under_way.setdefault(there, index) != index:
             raise Ambiguous(f"two were at {np.frombuffer(there, dtype=np.float32).tolist()}")
-    beginnings = {observations[place] for place in np.flatnonzero(before < 0)}
+    beginnings = {observations[index] for index in np.flatnonzero(before < 0)}
     for there, last in zip(following, batch.last.tolist()):
         if not last and there in beginnings:
             where = np.frombuffer(there, dtype=np.float32).tolist()
@@ -111,17 +114,17 @@ def rows_before(batch: Batch) -> np.ndarray:
 
 
 def group_by_episode(batch: Batch, before: np.ndarray) -> list[np.ndarray]:
-    """The places of the rows of each episode. A row begins one if the row before it was the last of one, or led
-    elsewhere."""
+    """The indices of the rows of each episode. A row begins an episode if the row before it was ``last``, or had
+    another s' than this row's s."""
     observations, following = batch.observation.view(np.uint32), batch.next_observation.view(np.uint32)
     continues = (before >= 0) & ~batch.last[before] & (observations == following[before]).all(axis=1)
-    places: list[list[int]] = []
+    indices: list[list[int]] = []
     episode = np.empty(len(batch), dtype=np.int64)
-    for place, (previous, goes_on) in enumerate(zip(before.tolist(), continues.tolist())):
+    for index, (previous, goes_on) in enumerate(zip(before.tolist(), continues.tolist())):
         if goes_on:
-            episode[place] = episode[previous]
-            places[episode[place]].append(place)
+            episode[index] = episode[previous]
+            indices[episode[index]].append(index)
         else:
-            episode[place] = len(places)
-            places.append([place])
-    return [np.array(one) for one in places]
+            episode[index] = len(indices)
+            indices.append([index])
+    return [np.array(one) for one in indices]

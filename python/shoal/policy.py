@@ -18,7 +18,7 @@ MAGIC = b"SHOALPOL"
 VERSION = 1
 
 #: The words before the parameters.
-HEAD = struct.Struct("<QQQddQQ")
+HEADER = struct.Struct("<QQQddQQ")
 
 #: A normalised number is clipped to this range on both sides of 0 (``common/policy/src/network/normalise.rs``).
 OBSERVATION_CLIP = np.float32(10.0)
@@ -42,9 +42,9 @@ class Policy:
 
     def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
         body = unseal(path)
-        words = HEAD.unpack_from(body)
+        words = HEADER.unpack_from(body)
         _, self.version, self.env_steps, self.return_mean, self.return_std, self.episodes, count = words
-        parameters = np.frombuffer(body, dtype="<f4", offset=HEAD.size)
+        parameters = np.frombuffer(body, dtype="<f4", offset=HEADER.size)
         if len(parameters) != count:
             raise ShoalError(f"{path}: its parts do not fit together")
         self.algorithm = next((name for name in ALGORITHMS if name in config), "")
@@ -52,7 +52,7 @@ class Policy:
             raise ShoalError(f"{path}: the run's configuration has no spaces, or no algorithm that this package knows")
         self._observation, self._action = config["spec"]["observation"], config["spec"]["action"]
         settings = config[self.algorithm]
-        outputs, self._head = ALGORITHMS[self.algorithm](width(self._action), settings)
+        outputs, self._output_kind = ALGORITHMS[self.algorithm](size(self._action), settings)
         self._dueling = bool(settings.get("dueling", False))
         self._table: np.ndarray | None = None
         self._layers: list[tuple[np.ndarray, np.ndarray]] = []
@@ -66,12 +66,12 @@ class Policy:
         self, parameters: np.ndarray, settings: Mapping[str, Any], outputs: int, config: Mapping[str, Any]
     ) -> int:
         """Splits the parameters into tables or layers. Returns how many there must be."""
-        if self._head == "table":
-            states = width(self._observation)
+        if self._output_kind == "table":
+            states = size(self._observation)
             if len(parameters) == states * outputs:
                 self._table = parameters.reshape(states, outputs)
             return states * outputs
-        sizes = [observed(self._observation), *settings["hidden"], outputs]
+        sizes = [width(self._observation), *settings["hidden"], outputs]
         place = 0
         for inputs, units in zip(sizes, sizes[1:]):
             weights, biases = parameters[place:][: inputs * units], parameters[place + inputs * units :][:units]
@@ -88,7 +88,7 @@ class Policy:
     def __call__(self, observations: npt.ArrayLike) -> np.ndarray:
         """The actions for one observation or for a batch of them."""
         outputs, single = self._outputs(observations)
-        if self._head in ("table", "scores"):
+        if self._output_kind in ("table", "scores"):
             actions = np.argmax(outputs, axis=1) + int(self._action["discrete"].get("start", 0))
         else:
             low, high = (np.asarray(self._action["box"][end], dtype=np.float32) for end in ("low", "high"))
@@ -99,7 +99,7 @@ class Policy:
 
     def scores(self, observations: npt.ArrayLike) -> np.ndarray:
         """The score of each discrete action: its value, or the logit of its probability (REINFORCE)."""
-        if self._head not in ("table", "scores"):
+        if self._output_kind not in ("table", "scores"):
             raise ShoalError("a policy with real-valued actions has no scores")
         outputs, single = self._outputs(observations)
         return outputs[0] if single else outputs
@@ -110,7 +110,7 @@ class Policy:
             start = int(self._observation["discrete"].get("start", 0))
             rows = np.clip(states.reshape(-1).astype(np.int64) - start, 0, len(self._table) - 1)
             return self._table[rows], states.ndim == 0
-        inputs = observed(self._observation)
+        inputs = width(self._observation)
         if "discrete" in self._observation:
             # A network sees an index as a number, counted from 0.
             states = np.asarray(observations)
@@ -152,12 +152,12 @@ ALGORITHMS = {
 }
 
 
-def width(space: Mapping[str, Any]) -> int:
+def size(space: Mapping[str, Any]) -> int:
     """The numbers of a box, or how many indices a discrete space has."""
     return len(space["box"]["low"]) if "box" in space else int(space["discrete"]["n"])
 
 
-def observed(space: Mapping[str, Any]) -> int:
+def width(space: Mapping[str, Any]) -> int:
     """The numbers of an observation: one for an index."""
     return len(space["box"]["low"]) if "box" in space else 1
 
@@ -172,7 +172,7 @@ def unseal(path: Path) -> bytes:
         raise ShoalError(f"{path} cannot be read: {error.strerror}") from error
     if data[:8] != MAGIC:
         raise ShoalError(f"{path} is not a policy file")
-    if len(data) < 16 + HEAD.size or zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
+    if len(data) < 16 + HEADER.size or zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
         raise ShoalError(f"{path} is damaged or cut short (checksum)")
     version = int.from_bytes(data[8:12], "little")
     if version != VERSION:

@@ -63,7 +63,7 @@ def text_of(value: Any) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
-        pairs = (f"{json.dumps(str(key))} = {toml_value(item)}" for key, item in value.items())
+        pairs = (f"{toml_string(str(key))} = {toml_value(item)}" for key, item in value.items())
         return "{" + ", ".join(pairs) + "}"
     if isinstance(value, Sequence):
         return "[" + ", ".join(toml_value(item) for item in value) + "]"
@@ -71,7 +71,12 @@ def text_of(value: Any) -> str:
 
 
 def toml_value(value: Any) -> str:
-    return json.dumps(value) if isinstance(value, str) else text_of(value)
+    return toml_string(value) if isinstance(value, str) else text_of(value)
+
+
+def toml_string(text: str) -> str:
+    """The text as TOML writes it. JSON's escapes of characters above U+FFFF are surrogates, which TOML refuses."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def settings(values: Mapping[str, Any] | None) -> list[str]:
@@ -80,10 +85,10 @@ def settings(values: Mapping[str, Any] | None) -> list[str]:
 
 
 #: The exit code of `shoal status` for a run that is not running.
-NOT_RUNNING = 3
+NOT_RUNNING_EXIT_CODE = 3
 
 #: How the message of `shoal stop` begins for such a run.
-NOTHING_RUNS = "nothing runs in "
+NOT_RUNNING_MESSAGE = "nothing runs in "
 
 
 def call(arguments: Sequence[str | os.PathLike[str]], accepted: Sequence[int] = (0,)) -> str:
@@ -112,7 +117,8 @@ def follow(command: Sequence[str], quiet: bool) -> str:
     If this Python is interrupted, the training is too: it saves what it has, and then ``KeyboardInterrupt`` is raised.
     If it is killed, the training ends and can be resumed.
     """
-    # The system kills a tied program with the thread that started it, which waits here. The roles save and end then.
+    # The kernel kills the program when the thread that started it ends; that thread waits here. Once the launcher is
+    # dead, the roles save what they have and end.
     command = [program(), "tied", str(os.getpid()), *command]
     last: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
     with tempfile.TemporaryFile("w+", **TEXT) as printed:
@@ -224,39 +230,35 @@ def train_suite(
 
 def _item(value: Any) -> str:
     """A value in the list of ``--sweep``, in which commas separate values."""
-    return json.dumps(value) if isinstance(value, str) and "," in value else text_of(value)
+    return toml_string(value) if isinstance(value, str) and "," in value else text_of(value)
 
 
-def _arguments(
-    what: str,
-    *,
-    run: str | os.PathLike[str] | None = None,
-    steps: int | None = None,
-    episodes: int | None = None,
-    seed: int | None = None,
-    actors: int | None = None,
-    envs: int | None = None,
-    method: str | None = None,
-    lockstep: bool = False,
-    set: Mapping[str, Any] | None = None,
-    from_run: str | os.PathLike[str] | Run | None = None,
-    with_replay: bool = False,
-    demonstrations: str | None = None,
-) -> list[str]:
+#: The arguments of :func:`train` that are options with a value.
+OPTIONS = {
+    "run": "--run",
+    "steps": "--steps",
+    "episodes": "--episodes",
+    "seed": "--seed",
+    "actors": "--actors",
+    "envs": "--envs",
+    "method": "--method",
+    "from_run": "--from",
+    "demonstrations": "--demonstrations",
+}
+
+#: The arguments of :func:`train` that are options without a value.
+SWITCHES = {"lockstep": "--lockstep", "with_replay": "--with-replay"}
+
+
+def _arguments(what: str, set: Mapping[str, Any] | None = None, **given: Any) -> list[str]:
     """The arguments of the program for these arguments of :func:`train`."""
-    options: list[tuple[str, object]] = [
-        ("--run", run),
-        ("--steps", steps),
-        ("--episodes", episodes),
-        ("--seed", seed),
-        ("--actors", actors),
-        ("--envs", envs),
-        ("--method", method),
-        ("--from", getattr(from_run, "path", from_run)),
-        ("--demonstrations", demonstrations),
-    ]
+    unknown = given.keys() - OPTIONS.keys() - SWITCHES.keys()
+    if unknown:
+        raise TypeError(f"unexpected argument {min(unknown)!r}")
     arguments = ["train", what, "--json"]
-    arguments += [str(part) for option, value in options if value is not None for part in (option, value)]
-    arguments += ["--lockstep"] if lockstep else []
-    arguments += ["--with-replay"] if with_replay else []
+    for name, option in OPTIONS.items():
+        value = given.get(name)
+        if value is not None:
+            arguments += [option, str(getattr(value, "path", value) if name == "from_run" else value)]
+    arguments += [option for name, option in SWITCHES.items() if given.get(name)]
     return arguments + settings(set)

@@ -76,7 +76,7 @@ class Run:
         return tables.read(self.path / f"{name}.csv")
 
     def frame(self, name: str = "evaluations") -> pandas.DataFrame:
-        """The same as a DataFrame; this needs pandas."""
+        """``<name>.csv`` of the run as a ``DataFrame``. This needs pandas."""
         try:
             import pandas
         except ImportError as error:
@@ -131,7 +131,7 @@ class Run:
 
     def status(self) -> dict[str, Any]:
         """What ``shoal status --json`` says."""
-        return json.loads(program.call(["status", self.path, "--json"], accepted=(0, program.NOT_RUNNING)))
+        return json.loads(program.call(["status", self.path, "--json"], accepted=(0, program.NOT_RUNNING_EXIT_CODE)))
 
     def scale(self, actors: int) -> None:
         """Changes the number of actors while the run is running."""
@@ -146,7 +146,7 @@ class Run:
         try:
             program.call(["stop", self.path])
         except ShoalError as error:
-            if not str(error).startswith(program.NOTHING_RUNS):
+            if not str(error).startswith(program.NOT_RUNNING_MESSAGE):
                 raise
 
     def wait(self, timeout: float | None = None) -> Run:

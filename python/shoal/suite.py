@@ -33,8 +33,9 @@ class Suite:
 
     @property
     def trials(self) -> list[dict[str, Any]]:
-        """All its runs, begun or not, in their order: ``name`` is the name of a run's directory, ``seed`` its seed
-        (``None``: the preset's), ``set`` a list of what it has of its own, each as ``"SECTION.KEY=VALUE"``."""
+        """All runs of the suite in their order, started or not. ``name`` is the name of the run's directory, ``seed``
+        its seed (``None``: the preset's), and ``set`` the settings in which it differs, each as
+        ``"SECTION.KEY=VALUE"``."""
         file = self.path / "suite.json"
         try:
             return [

@@ -25,7 +25,7 @@ from .run import Run
 from .suite import Suite
 
 #: The files that are followed, and what their metrics are called.
-FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
+TABLES = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
 
 #: Columns that are no measurements: times, numbers of things, and flags.
 NOT_METRICS = {"wall_seconds", "env_steps", "actor", "environment", "best", "terminated"}
@@ -65,24 +65,21 @@ class Tracker(Protocol):
 class MLflow:
     """A run of MLflow, in the store that ``MLFLOW_TRACKING_URI`` names, by default a local one."""
 
-    def __init__(self, run: Run, project: str, group: str | None, begun: float, known: str | None) -> None:
+    def __init__(self, run: Run, project: str, group: str | None, begun: float, tracker_id: str | None) -> None:
         try:
             from mlflow import MlflowClient
             from mlflow.entities import Metric
         except ImportError as error:
             raise ShoalError("--to mlflow needs the package mlflow: pip install mlflow") from error
-        try:
-            self._client, self._metric = MlflowClient(), Metric
-        except Exception as error:
-            raise ShoalError(f"MLflow's store cannot be used: {error}") from error
+        self._client, self._metric = MlflowClient(), Metric
         experiment = self._client.get_experiment_by_name(project)
         number = experiment.experiment_id if experiment else self._client.create_experiment(project)
-        if known is None:
+        if tracker_id is None:
             tags = {"shoal.run": str(run.path), **({"shoal.suite": group} if group else {})}
-            known = self._client.create_run(number, run_name=run.path.name, tags=tags).info.run_id
+            tracker_id = self._client.create_run(number, run_name=run.path.name, tags=tags).info.run_id
         else:
-            self._client.update_run(known, status="RUNNING")
-        self.id: str = known
+            self._client.update_run(tracker_id, status="RUNNING")
+        self.id: str = tracker_id
         self._begun = int(1000 * begun)
 
     def settings(self, settings: Mapping[str, Any]) -> None:
@@ -119,7 +116,7 @@ class MLflow:
 class WeightsAndBiases:
     """A run of Weights & Biases, in the mode that ``WANDB_MODE`` names; ``offline`` needs no account."""
 
-    def __init__(self, run: Run, project: str, group: str | None, begun: float, known: str | None) -> None:
+    def __init__(self, run: Run, project: str, group: str | None, begun: float, tracker_id: str | None) -> None:
         try:
             import wandb
         except ImportError as error:
@@ -127,7 +124,7 @@ class WeightsAndBiases:
         self._wandb = wandb
         directory = os.environ.get("WANDB_DIR", str(run.path))
         self._run = wandb.init(
-            project=project, name=run.path.name, group=group, id=known, resume="allow", dir=directory
+            project=project, name=run.path.name, group=group, id=tracker_id, resume="allow", dir=directory
         )
         self.id: str = self._run.id
         self._run.define_metric("env_steps")
@@ -156,6 +153,17 @@ class WeightsAndBiases:
 TRACKERS: dict[str, type] = {"mlflow": MLflow, "wandb": WeightsAndBiases}
 
 
+@contextlib.contextmanager
+def errors_of(tracker: str) -> Iterator[None]:
+    """Errors of the tracker's package become a :class:`ShoalError` of one line."""
+    try:
+        yield
+    except (ShoalError, OSError):
+        raise
+    except Exception as error:
+        raise ShoalError(f"{tracker}: {' '.join(str(error).split()) or type(error).__name__}") from error
+
+
 def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", follow: bool = True) -> None:
     """Copies a run, or each run of a suite, to the tracker ``"mlflow"`` or ``"wandb"``.
 
@@ -166,12 +174,12 @@ def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", foll
         raise ShoalError(f"there is no tracker {to!r}; choose one of {', '.join(TRACKERS)}")
     path = Path(path).absolute()
     group = path.name if (path / "suite.json").is_file() else None
-    tracked: dict[Path, Copy] = {}
+    tracked: dict[Path, TrackedRun] = {}
     try:
         while True:
             for run in runs(path):
                 if run.path not in tracked:
-                    tracked[run.path] = Copy(run, to, project, group)
+                    tracked[run.path] = TrackedRun(run, to, project, group)
             # Looked at before copying, so that a run's last lines are copied too.
             continues = any(map(is_locked, [path, *tracked]))
             for copy in tracked.values():
@@ -191,29 +199,34 @@ def runs(path: Path) -> list[Run]:
     return Suite(path).runs if (path / "suite.json").is_file() else [Run(path)]
 
 
-class Copy:
+class TrackedRun:
     """A run and its copy in a tracker."""
 
     def __init__(self, run: Run, to: str, project: str, group: str | None) -> None:
         self.run = run
         self._file = run.path / f"tracking-{to}.json"
         state = self._load()
-        # The file is written again when a setting changes.
-        self._begun: float = state.get("begun", (run.path / "config.toml").stat().st_mtime)
+        self._begun: float = state.get("begun") or started(run)
         self._lines: dict[str, int] = state.get("lines", {})
         self._result: dict[str, Any] | None = state.get("result")
-        self._tracker: Tracker = TRACKERS[to](run, project, group, self._begun, state.get("id"))
+        self._to = to
+        with errors_of(to):
+            self._tracker: Tracker = TRACKERS[to](run, project, group, self._begun, state.get("id"))
 
     def update(self) -> None:
         """Copies what was added since."""
-        self._tracker.settings(dict(flat(self.run.config)))
-        for name, prefix in FOLLOWED.items():
+        settings = dict(flat(self.run.config))
+        with errors_of(self._to):
+            self._tracker.settings(settings)
+        for name, prefix in TABLES.items():
             if not has_header(self.run.path / f"{name}.csv"):
                 # The run starts: its launcher has not made its tables yet.
                 continue
             table = self.run.table(name)
             done = self._lines.get(name, 0)
-            self._tracker.metrics(list(rows(table[done:], prefix)))
+            added = list(rows(table[done:], prefix))
+            with errors_of(self._to):
+                self._tracker.metrics(added)
             self._lines[name] = len(table)
             self._save()
 
@@ -224,15 +237,19 @@ class Copy:
             for policy in result["policies"]:
                 name = policy["policy"]
                 values = {f"final/{name}_{key}": policy[key] for key in ("return_mean", "return_std", "episodes")}
-                self._tracker.result({key: value for key, value in values.items() if value is not None})
+                values = {key: value for key, value in values.items() if value is not None}
+                with errors_of(self._to):
+                    self._tracker.result(values)
             self._result = result
             self._save()
         files = [self.run.path / name for name in ARTIFACTS] + sorted(self.run.path.glob("*.svg"))
-        self._tracker.files(self.run, [path for path in files if path.is_file()])
+        with errors_of(self._to):
+            self._tracker.files(self.run, [path for path in files if path.is_file()])
         outcome = self.run.path / "outcome.json"
         finished = outcome.is_file() and json.loads(outcome.read_text(encoding="utf-8"))["state"] == "finished"
         running = is_locked(self.run.path)
-        self._tracker.close("running" if running else "finished" if finished else "stopped")
+        with errors_of(self._to):
+            self._tracker.close("running" if running else "finished" if finished else "stopped")
 
     def _load(self) -> dict[str, Any]:
         try:
@@ -252,6 +269,18 @@ class Copy:
             # Before it is renamed: a power loss must not leave an empty file with the final name.
             os.fsync(file.fileno())
         new.replace(self._file)
+
+
+def started(run: Run) -> float:
+    """When the run was started, in seconds since 1970."""
+    file = run.path / "start.json"
+    try:
+        return float(json.loads(file.read_text(encoding="utf-8"))["started"])
+    except FileNotFoundError:
+        # A run of an earlier version. Its configuration is written again when a setting changes.
+        return (run.path / "config.toml").stat().st_mtime
+    except (ValueError, KeyError, TypeError) as error:
+        raise ShoalError(f"{file} is damaged; remove it, and the time of config.toml counts as the start") from error
 
 
 def has_header(path: Path) -> bool:

@@ -22,7 +22,8 @@ class Batch:
     Attributes:
         row: the number of each transition, counted over the life of the run.
         observation: s, in the environment's units.
-        action: a, as chosen; an index for discrete actions. Of an integer box, the environment got the nearest integers.
+        action: a, as chosen; an index for discrete actions. In an integer box, the environment received the nearest
+            integers.
         reward: r; of several steps (``replay.n_step``), their discounted sum.
         discount: of the value of s': γ, γᵏ for k steps, or 0 where s' is terminal.
         next_observation: s'.
@@ -60,12 +61,12 @@ class Transitions:
             raise ShoalError(f"{path} cannot be mapped: {error}") from error
         if len(self._words) < 2 * BLOCK // 8 or self._words[0] != MAGIC:
             raise ShoalError(f"{path} is not a replay file")
-        identity = [int(word) for word in self._words[:10]]
-        if identity[1] != VERSION:
-            raise ShoalError(f"{path} has format {identity[1]}; this package reads format {VERSION}")
-        if zlib.crc32(self._words[:9].tobytes()) != identity[9]:
+        preamble = [int(word) for word in self._words[:10]]
+        if preamble[1] != VERSION:
+            raise ShoalError(f"{path} has format {preamble[1]}; this package reads format {VERSION}")
+        if zlib.crc32(self._words[:9].tobytes()) != preamble[9]:
             raise ShoalError(f"the header of {path} is damaged (checksum)")
-        self._observation, self._action, width, self.ring, actors, snapshot = identity[2:8]
+        self._observation, self._action, width, self.ring, actors, snapshot = preamble[2:8]
         blocks = lambda size: -(-size // BLOCK) * BLOCK  # noqa: E731
         self._actors, self._stride = actors, 3 + snapshot
         self._slot = blocks(8 * (1 + 3 + actors * self._stride))
@@ -94,7 +95,8 @@ class Transitions:
         return range(min(max(tail, int(self._words[horizon]) - self.ring), head), head)
 
     def written(self) -> tuple[int, int]:
-        """How many of all rows so far the run began with, and how many actors have collected the others."""
+        """The number of initial rows, with which the run began, and the number of actors that have collected the
+        others."""
         record = self._record(4 + self._actors * self._stride)
         rows = record[4 + 2 :: self._stride]
         return int(record[2]) - int(rows.sum()), int(np.count_nonzero(rows))

@@ -65,8 +65,8 @@ def main() -> int:
 
 
 def _take_streams() -> int:
-    """Leaves empty input to the environment and sends what it prints to the log. The descriptor by which the launcher ends
-    this process."""
+    """Gives the environment an empty standard input, and sends what it prints to the log. Returns a descriptor of the
+    original standard input, by which the launcher ends this process."""
     control = os.dup(0)
     empty = os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)

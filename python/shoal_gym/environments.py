@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from . import spaces
 from .pictures import Pictures
-from .spaces import Invalid, Unsupported, served
+from .spaces import Invalid, Unsupported, codec_of
 
 SEEDS = 2**31
 """Seeds of episodes are below this: some simulators take no others."""
@@ -53,6 +53,18 @@ class Blocks:
         return 2 * count * width + 3 * count
 
 
+@dataclass
+class Slot:
+    """An environment and its episode."""
+
+    environment: gym.Env[Any, Any]
+    next_training: int = 0
+    next_evaluation: int = 0
+    episode: int = 0
+    steps: int = 0
+    over: bool = False
+
+
 class Environments:
     """``count`` environments, each in its own episode.
 
@@ -76,10 +88,10 @@ class Environments:
         _seed_process(seed, server, stream)
         parameters = {"disable_env_checker": True, **parameters}
         os.environ["SHOAL_SERVER"] = str(server)
-        self._environments = [_make(name, parameters, e, pictures) for e in range(count)]
-        first = self._environments[0]
-        self.observation = served(first.observation_space, "observations")
-        self.action = served(first.action_space, "actions")
+        self._slots = [Slot(_make(name, parameters, e, pictures)) for e in range(count)]
+        first = self._slots[0].environment
+        self.observation = codec_of(first.observation_space, "observations")
+        self.action = codec_of(first.action_space, "actions")
         limit = first.spec.max_episode_steps if first.spec else None
         if limit is None:
             raise Unsupported(
@@ -88,57 +100,55 @@ class Environments:
         self.time_limit = int(limit)
         self._seed, self._server, self._stream = seed, server, stream
         self._purpose = Purpose.TRAINING
-        self._next_training = [0] * count
-        self._next_evaluation = [0] * count
         self._end_of_evaluation: int | None = None
-        self._episode = [0] * count
-        self._steps = [0] * count
-        self._over = [False] * count
 
     def __len__(self) -> int:
-        return len(self._environments)
+        return len(self._slots)
 
     def begin_next(self, blocks: Blocks) -> None:
-        """Each environment begins its next training episode. ``Invalid`` where an environment breaks Gymnasium's interface."""
+        """Each environment begins its next training episode. Raises ``Invalid`` if one breaks Gymnasium's interface."""
         self._purpose = Purpose.TRAINING
         self._begin_all(blocks)
 
     def begin_training(self, episode: int, blocks: Blocks) -> None:
-        """Each environment begins this training episode of its own, and counts on from there. ``Invalid`` as above."""
-        self._next_training = [episode] * len(self)
+        """Each environment begins this training episode of its own, and counts on from there. Raises ``Invalid`` as
+        above."""
+        for slot in self._slots:
+            slot.next_training = episode
         self.begin_next(blocks)
 
     def begin_evaluation(self, first: int, count: int, blocks: Blocks) -> None:
-        """Environment e begins evaluation episode ``first`` + e; at its end it continues with the one ``len(self)`` later, as
-        long as that is one of the ``count`` first; 0 is no limit. ``Invalid`` as above."""
+        """Environment e begins evaluation episode ``first`` + e; at its end it continues with the one ``len(self)``
+        later, as long as that is one of the ``count`` first; 0 is no limit. Raises ``Invalid`` as above."""
         self._purpose = Purpose.EVALUATION
-        self._next_evaluation = [first + e for e in range(len(self))]
+        for e, slot in enumerate(self._slots):
+            slot.next_evaluation = first + e
         self._end_of_evaluation = first + count if count else None
         self._begin_all(blocks)
 
     def step(self, actions: NDArray[Any], blocks: Blocks) -> None:
-        """Every environment takes a step with its action, an element of the action space. ``Invalid`` where an environment
-        breaks Gymnasium's interface; then new episodes have to be begun."""
+        """Every environment takes a step with its action, an element of the action space. Raises ``Invalid`` if one
+        breaks Gymnasium's interface; then new episodes must be begun."""
         next_observations = self.observation.view(blocks.next_observations)
         over = []
-        for e, (environment, action) in enumerate(zip(self._environments, actions, strict=True)):
-            if self._over[e]:
+        for e, (slot, action) in enumerate(zip(self._slots, actions, strict=True)):
+            if slot.over:
                 # Its last evaluation episode has ended.
                 next_observations[e] = self.observation.view(blocks.observations)[e] = 0
                 blocks.rewards[e] = blocks.terminated[e] = blocks.truncated[e] = 0
                 continue
-            self._steps[e] += 1
+            slot.steps += 1
             try:
-                # Gymnasium's own wrappers see to it that there are five.
-                observation, reward, terminated, truncated, _ = environment.step(action)
-                next_observations[e] = self.observation.number(observation)
+                # Gymnasium's wrappers guarantee five values.
+                observation, reward, terminated, truncated, _ = slot.environment.step(action)
+                next_observations[e] = self.observation.encode(observation)
                 blocks.rewards[e] = spaces.reward(reward)
                 terminated = spaces.flag(terminated, "terminated")
                 truncated = spaces.flag(truncated, "truncated")
             except Invalid as reason:
                 raise self._invalid(e, "step", reason) from None
             blocks.terminated[e] = terminated
-            # A terminal state is one, at whatever step it is reached.
+            # A step that does both has terminated (`docs/PROTOCOL.md`).
             blocks.truncated[e] = truncated and not terminated
             if terminated or truncated:
                 over.append(e)
@@ -148,8 +158,8 @@ class Environments:
             self._begin(e, blocks)
 
     def close(self) -> None:
-        for environment in self._environments:
-            environment.close()
+        for slot in self._slots:
+            slot.environment.close()
 
     def _begin_all(self, blocks: Blocks) -> None:
         for e in range(len(self)):
@@ -158,33 +168,34 @@ class Environments:
 
     def _draw(self) -> None:
         if self._pictures is not None:
-            self._pictures.draw(self._environments[0])
+            self._pictures.draw(self._slots[0].environment)
 
     def _begin(self, e: int, blocks: Blocks) -> None:
+        slot = self._slots[e]
         if self._purpose is Purpose.EVALUATION:
-            episode = self._next_evaluation[e]
-            self._over[e] = self._end_of_evaluation is not None and episode >= self._end_of_evaluation
-            if self._over[e]:
+            episode = slot.next_evaluation
+            slot.over = self._end_of_evaluation is not None and episode >= self._end_of_evaluation
+            if slot.over:
                 blocks.observations[e] = 0
                 return
             words = [self._seed, Purpose.EVALUATION, episode]
-            self._next_evaluation[e] += len(self)
+            slot.next_evaluation += len(self)
         else:
-            episode = self._next_training[e]
-            self._over[e] = False
+            episode = slot.next_training
+            slot.over = False
             words = [self._seed, Purpose.TRAINING, self._server, self._stream, e, episode]
-            self._next_training[e] += 1
-        self._episode[e], self._steps[e] = episode, 0
+            slot.next_training += 1
+        slot.episode, slot.steps = episode, 0
         try:
-            observation = _pair(self._environments[e].reset(seed=_seed_of(words)))
-            self.observation.view(blocks.observations)[e] = self.observation.number(observation)
+            observation = _pair(slot.environment.reset(seed=_seed_of(words)))
+            self.observation.view(blocks.observations)[e] = self.observation.encode(observation)
         except Invalid as reason:
             raise self._invalid(e, "reset", reason) from None
 
     def _invalid(self, e: int, method: str, reason: Invalid) -> Invalid:
         """``reason``, and where the value came from."""
         purpose = "evaluation" if self._purpose is Purpose.EVALUATION else "training"
-        where = f"environment {e}, {purpose} episode {self._episode[e]}, step {self._steps[e]}"
+        where = f"environment {e}, {purpose} episode {self._slots[e].episode}, step {self._slots[e].steps}"
         return Invalid(f"{self._name}: {method} returned {reason} ({where})")
 
 
@@ -200,7 +211,8 @@ def _seed_of(words: list[int]) -> int:
 
 
 def _seed_process(seed: int, server: int, stream: int) -> None:
-    """Seeds what an environment may draw from behind Gymnasium's back: in lockstep every start draws alike."""
+    """Seeds the global generators of Python and NumPy, which an environment may use beside its own. In lockstep every
+    start draws the same numbers."""
     word = _seed_of([seed, Purpose.PROCESS, server, stream])
     random.seed(word)
     np.random.seed(word)

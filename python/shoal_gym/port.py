@@ -15,9 +15,9 @@ POLLS = 200
 """Polls before a waiting process blocks: the client's next request comes soon, where it has a core to itself."""
 
 SLEEP = 0.05
-"""Seconds a process blocks before it refreshes its connections."""
+"""Seconds for which a process blocks before it looks at standard input and sends a heartbeat that is due."""
 
-BEAT = 0.5
+HEARTBEAT_INTERVAL = 0.5
 """Seconds between heartbeats."""
 
 PROVEN = 1000
@@ -35,19 +35,19 @@ REFUSALS = (
 )
 """How iceoryx2 refuses a service or a port in it."""
 
-PASSING = frozenset(
+TEMPORARY = frozenset(
     {
         # Every place is taken, perhaps by a process that was killed and is not cleaned up after yet.
         "ExceedsMaxNumberOfNodes",
         "ExceedsMaxSupportedServers",
         "ExceedsMaxSupportedListeners",
         "ExceedsMaxSupportedNotifiers",
-        # A process was killed over making it, which the launcher will remove.
+        # A process was killed while it made the service; the launcher removes what is unfinished.
         "HangsInCreation",
         "Interrupt",
     }
 )
-"""Refusals that may pass, by the names that iceoryx2's Python package gives them: it has no other way to tell them apart."""
+"""Temporary refusals, by the names that iceoryx2's Python package gives them: nothing else tells them apart."""
 
 T = TypeVar("T")
 
@@ -60,9 +60,9 @@ class Unreachable(Exception):
     """A port in the run's shared memory is unavailable."""
 
 
-def make_port(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
-    """Makes a port. A refusal that may pass is tried again for a while, with ``look_out`` before each new try; any other one
-    is final.
+def make_port(attempt: Callable[[], T], check_end: Callable[[], None]) -> T:
+    """Makes a port. After a temporary refusal this is tried again for a while, with ``check_end`` before each new try.
+    Any other refusal is final.
 
     Raises ``Unreachable`` with the refusal."""
     deadline = time.monotonic() + TIMEOUT
@@ -70,9 +70,9 @@ def make_port(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
         try:
             return attempt()
         except REFUSALS as refusal:
-            if str(refusal) not in PASSING or time.monotonic() > deadline:
+            if str(refusal) not in TEMPORARY or time.monotonic() > deadline:
                 raise Unreachable(f"cannot join the run's shared memory: {refusal!r}") from refusal
-        look_out()
+        check_end()
         time.sleep(0.005)
 
 
@@ -102,7 +102,7 @@ class Port:
             .initial_max_slice_len(longest)
             .max_loaned_responses_per_request(2)
             .create(),
-            self._look_out,
+            self._check_end,
         )
         self._listener = make_port(
             lambda: self._service(protocol.event(run, f"env-server/{index}"))
@@ -110,11 +110,11 @@ class Port:
             .open()
             .listener_builder()
             .create(),
-            self._look_out,
+            self._check_end,
         )
         self._notifier = make_port(
             lambda: self._service(protocol.event(run, client)).event().open().notifier_builder().create(),
-            self._look_out,
+            self._check_end,
         )
         self._heartbeat_port: Any = None
         self._heartbeats = protocol.heartbeats(run)
@@ -124,7 +124,7 @@ class Port:
             activity=Activity.WAITING_FOR_PEER,
             incarnation=incarnation,
         )
-        self._beaten = -BEAT
+        self._last_heartbeat_at = -HEARTBEAT_INTERVAL
 
     def next_request(self) -> Any:
         """Waits for the next request."""
@@ -133,12 +133,12 @@ class Port:
                 request = self._server.receive()
                 if request is not None:
                     return request
-            self._look_out()
+            self._check_end()
             self.beat(Activity.WAITING_FOR_PEER)
             try:
                 self._listener.timed_wait(iox2.Duration.from_secs_f64(SLEEP))
             except iox2.ListenerWaitError as error:
-                # So ends the wait of a process that was stopped and is continued.
+                # The process was stopped and continued during the wait.
                 if str(error) != "InterruptSignal":
                     raise
 
@@ -154,7 +154,7 @@ class Port:
         made a step yet, so that the launcher can tell a process that dies in its first step from one that was waiting.
         """
         if self._heartbeat.steps == 0:
-            self._beaten = -BEAT
+            self._last_heartbeat_at = -HEARTBEAT_INTERVAL
             self.beat(Activity.WORKING)
 
     def count(self, steps: int) -> None:
@@ -164,16 +164,16 @@ class Port:
         if steps == 0:
             return
         if self._heartbeat.steps == 0 or self._heartbeat.steps < PROVEN <= self._heartbeat.steps + steps:
-            self._beaten = -BEAT
+            self._last_heartbeat_at = -HEARTBEAT_INTERVAL
         self._heartbeat.steps += steps
         self.beat(Activity.WORKING)
 
     def beat(self, activity: Activity) -> None:
         """Tells the launcher that this process lives, if it is time to."""
         now = time.monotonic()
-        if now - self._beaten < BEAT:
+        if now - self._last_heartbeat_at < HEARTBEAT_INTERVAL:
             return
-        self._beaten = now
+        self._last_heartbeat_at = now
         self._heartbeat.activity = activity
         try:
             # Outside of a run there is no launcher to tell.
@@ -200,7 +200,7 @@ class Port:
     def _service(self, name: str) -> Any:
         return self._node.service_builder(iox2.ServiceName.new(name))
 
-    def _look_out(self) -> None:
+    def _check_end(self) -> None:
         """Raises ``Ended`` once the launcher ends this process, or is gone itself."""
         if select.select([self._control], [], [], 0.0)[0]:
             raise Ended

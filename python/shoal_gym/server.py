@@ -88,7 +88,7 @@ class Server:
             self._refuse(request, f"{len(actions)} numbers for the actions of {len(environments)} environments")
             return
         try:
-            chosen = environments.action.elements(actions)
+            chosen = environments.action.decode(actions)
         except ValueError as reason:
             self._refuse(request, str(reason))
             return

@@ -36,8 +36,8 @@ class Box:
         """``block``, ``width`` numbers for each environment, with an element of the space for each."""
         return block.reshape(len(block), *self._shape)
 
-    def number(self, element: Any) -> NDArray[np.float32]:
-        """What represents an element in such a view. ``Invalid`` for what is no element."""
+    def encode(self, element: Any) -> NDArray[np.float32]:
+        """What represents an element in such a view. Raises ``Invalid`` for what is no element."""
         array = _array(element)
         if array.shape != self._shape:
             raise Invalid(f"an observation of shape {array.shape}, and its space has shape {self._shape}")
@@ -50,16 +50,16 @@ class Box:
             raise Invalid(f"an observation whose number {at} is {array.reshape(-1)[at]}, which is not finite as a 32-bit float")
         return converted
 
-    def elements(self, numbers: NDArray[np.float32]) -> NDArray[Any]:
-        """The elements that ``width`` numbers each represent, within the bounds and in memory of their own. ``ValueError``
-        for numbers that represent none."""
+    def decode(self, numbers: NDArray[np.float32]) -> NDArray[Any]:
+        """The elements that ``width`` numbers each represent, within the bounds and in memory of their own. Raises
+        ``ValueError`` for numbers that represent none."""
         if not np.isfinite(numbers).all():
             raise ValueError(f"{numbers} are not finite")
         elements = numbers.astype(np.float64).reshape(-1, *self._shape)
         if self._integers:
             elements = np.rint(elements)
-        # In the type of the space, whose bounds are not those that travelled: 0.05 is one number with 32 bits and another
-        # one with 64.
+        # The last clip is in the type of the space: a bound such as 0.05 is another number in 64 bits than in the 32
+        # bits of a response.
         low, high = self._space.low, self._space.high
         inside = np.clip(elements, low.astype(np.float64), high.astype(np.float64)).astype(self._space.dtype)
         return np.clip(inside, low, high)
@@ -82,8 +82,8 @@ class Discrete:
         """``block`` with a number for each environment."""
         return block.reshape(len(block))
 
-    def number(self, element: Any) -> int:
-        """What represents an element in such a view. ``Invalid`` for what is no element."""
+    def encode(self, element: Any) -> int:
+        """What represents an element in such a view. Raises ``Invalid`` for what is no element."""
         array = _array(element)
         if array.shape != () or array.dtype.kind not in "iuf" or not np.isfinite(array) or array != np.rint(array):
             raise Invalid(f"the observation {_short(element)}, and its space has integers")
@@ -93,15 +93,15 @@ class Discrete:
             raise Invalid(f"the observation {int(array)}, and its space has {self.start} to {last}")
         return index
 
-    def elements(self, numbers: NDArray[np.float32]) -> NDArray[Any]:
-        """The elements that the numbers represent. ``ValueError`` for numbers that represent none."""
+    def decode(self, numbers: NDArray[np.float32]) -> NDArray[Any]:
+        """The elements that the numbers represent. Raises ``ValueError`` for numbers that represent none."""
         indices = numbers.astype(np.int64)
         if (indices != numbers).any() or (indices < 0).any() or (indices >= self.discrete).any():
             raise ValueError(f"{numbers} are no indices below {self.discrete}")
         return indices + self.start
 
 
-def served(space: gym.Space[Any], what: str) -> Box | Discrete:
+def codec_of(space: gym.Space[Any], what: str) -> Box | Discrete:
     """How a space is served; ``what`` is whose elements: of observations or of actions."""
     if isinstance(space, gym.spaces.Discrete):
         return Discrete(space)
@@ -111,7 +111,7 @@ def served(space: gym.Space[Any], what: str) -> Box | Discrete:
 
 
 def reward(value: Any) -> float:
-    """A reward as a number. ``Invalid`` for what is none."""
+    """A reward as a number. Raises ``Invalid`` for what is none."""
     number = value.item() if isinstance(value, np.generic | np.ndarray) and value.ndim == 0 else value
     if not isinstance(number, Real):
         raise Invalid(f"a reward that is {_short(value)} instead of a number")
@@ -126,7 +126,7 @@ def reward(value: Any) -> float:
 
 
 def flag(value: Any, what: str) -> bool:
-    """``terminated`` or ``truncated`` as a boolean. ``Invalid`` for what is none."""
+    """``terminated`` or ``truncated`` as a boolean. Raises ``Invalid`` for what is none."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, np.ndarray) and value.shape == () and value.dtype == np.bool_:
@@ -137,7 +137,7 @@ def flag(value: Any, what: str) -> bool:
 
 
 def _array(element: Any) -> NDArray[Any]:
-    """An observation as an array. ``Invalid`` for what cannot be one, such as lists of different lengths."""
+    """An observation as an array. Raises ``Invalid`` for what cannot be one, such as lists of different lengths."""
     try:
         return np.asarray(element)
     except (ValueError, TypeError, OverflowError) as error:

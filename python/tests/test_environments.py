@@ -15,7 +15,7 @@ from shoal_gym.spaces import Invalid
 BOX = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
 
-class Told(gym.Env[Any, Any]):
+class ScriptedEnvironment(gym.Env[Any, Any]):
     """Returns what it is told to, and notes what it is given."""
 
     observation_space = BOX
@@ -25,42 +25,43 @@ class Told(gym.Env[Any, Any]):
     given: list[Any] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        Told.given.append(seed)
-        return Told.reset_result
+        ScriptedEnvironment.given.append(seed)
+        return ScriptedEnvironment.reset_result
 
     def step(self, action: Any) -> Any:
-        Told.given.append(action)
-        return Told.step_result
+        ScriptedEnvironment.given.append(action)
+        return ScriptedEnvironment.step_result
 
 
-gym.register("Told-v0", entry_point=Told, max_episode_steps=1000)
+gym.register("Scripted-v0", entry_point=ScriptedEnvironment, max_episode_steps=1000)
 
 
-class Given(unittest.TestCase):
+class EnvironmentsTest(unittest.TestCase):
     def setUp(self) -> None:
-        Told.observation_space, Told.action_space = BOX, gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-        Told.reset_result = (np.zeros(3, np.float32), {})
-        Told.step_result = (np.zeros(3, np.float32), 0.0, False, False, {})
-        Told.given = []
+        ScriptedEnvironment.observation_space = BOX
+        ScriptedEnvironment.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        ScriptedEnvironment.reset_result = (np.zeros(3, np.float32), {})
+        ScriptedEnvironment.step_result = (np.zeros(3, np.float32), 0.0, False, False, {})
+        ScriptedEnvironment.given = []
 
     def make(self, count: int = 1, seed: int = 7) -> tuple[Environments, Blocks]:
-        environments = Environments("Told-v0", {"disable_env_checker": True}, count, seed, 2, 0)
+        environments = Environments("Scripted-v0", {"disable_env_checker": True}, count, seed, 2, 0)
         width = environments.observation.width
         response = np.full(Blocks.length(count, width), np.nan, np.float32)
         return environments, Blocks.of(response, count, width)
 
     def step(self, environments: Environments, blocks: Blocks) -> None:
         numbers = np.zeros(len(environments) * environments.action.width, np.float32)
-        environments.step(environments.action.elements(numbers), blocks)
+        environments.step(environments.action.decode(numbers), blocks)
 
     def refused(self, result: Any, *words: str) -> None:
         """A step that returns this is refused in these words, and where it was is stated."""
         environments, blocks = self.make()
         environments.begin_next(blocks)
-        Told.step_result = result
+        ScriptedEnvironment.step_result = result
         with self.assertRaises(Invalid) as caught:
             self.step(environments, blocks)
-        for word in [*words, "Told-v0", "environment 0, training episode 0, step 1"]:
+        for word in [*words, "Scripted-v0", "environment 0, training episode 0, step 1"]:
             self.assertIn(word, str(caught.exception))
         self.assertNotIn("\n", str(caught.exception))
 
@@ -95,7 +96,7 @@ class Given(unittest.TestCase):
         ]:
             self.refused(with_reward(reward), "reward", word)
 
-    def test_ends_that_are_no_booleans_are_refused(self) -> None:
+    def test_flags_that_are_not_booleans_are_refused(self) -> None:
         for value in [2, None, "no", 0.5, np.zeros(2, bool)]:
             self.refused((np.zeros(3), 0.0, value, False, {}), "terminated", "instead of a boolean")
             self.refused((np.zeros(3), 0.0, False, value, {}), "truncated", "instead of a boolean")
@@ -103,11 +104,11 @@ class Given(unittest.TestCase):
     def test_a_reset_that_returns_no_pair_is_refused(self) -> None:
         for result in [np.zeros(3), np.zeros(2), (np.zeros(3),), (np.zeros(3), None), None]:
             environments, blocks = self.make()
-            Told.reset_result = result
-            with self.assertRaisesRegex(Invalid, "Told-v0: reset returned something else than a pair"):
+            ScriptedEnvironment.reset_result = result
+            with self.assertRaisesRegex(Invalid, "Scripted-v0: reset returned something else than a pair"):
                 environments.begin_next(blocks)
 
-    def test_what_is_right_is_accepted_in_any_ordinary_type(self) -> None:
+    def test_valid_results_are_accepted_in_any_ordinary_type(self) -> None:
         environments, blocks = self.make()
         environments.begin_next(blocks)
         for result in [
@@ -115,25 +116,25 @@ class Given(unittest.TestCase):
             ([0, 0, 0], 1, False, False, {}),
             (np.zeros(3, np.int8), np.array(0.25), 0, np.array(False), None),
         ]:
-            Told.step_result = result
+            ScriptedEnvironment.step_result = result
             self.step(environments, blocks)
         self.assertEqual(blocks.rewards[0], 0.25)
-        Told.step_result = (np.ones(3), 1.0, True, True, {})
+        ScriptedEnvironment.step_result = (np.ones(3), 1.0, True, True, {})
         self.step(environments, blocks)
         self.assertEqual((blocks.terminated[0], blocks.truncated[0]), (1.0, 0.0))
         self.assertEqual(blocks.next_observations.tolist(), [[1.0] * 3])
         self.assertEqual(blocks.observations.tolist(), [[0.0] * 3], "the next episode's first")
 
     def test_indices_outside_their_space_are_refused(self) -> None:
-        Told.observation_space = gym.spaces.Discrete(4, start=1)
-        Told.reset_result = (1, {})
+        ScriptedEnvironment.observation_space = gym.spaces.Discrete(4, start=1)
+        ScriptedEnvironment.reset_result = (1, {})
         for value, words in [(0, "1 to 4"), (5, "1 to 4"), (2.7, "integers"), (np.array([2]), "integers")]:
             self.refused((value, 0.0, False, False, {}), words)
         for value in [float("inf"), float("nan"), 10**400]:
             self.refused((value, 0.0, False, False, {}), "integers")
         environments, blocks = self.make()
         environments.begin_next(blocks)
-        Told.step_result = (np.int64(4), 0.0, False, False, {})
+        ScriptedEnvironment.step_result = (np.int64(4), 0.0, False, False, {})
         self.step(environments, blocks)
         self.assertEqual(blocks.observations[0, 0], 3.0)
         self.assertEqual([bound.tolist() for bound in environments.observation.bounds()], [[1.0]])
@@ -146,30 +147,30 @@ class Given(unittest.TestCase):
             (gym.spaces.Box(0, 255, (1,), np.uint8), [-1.0, 254.7, 255.0, 300.0]),
             (gym.spaces.Discrete(3, start=-1), [0.0, 1.0, 2.0, 0.0]),
         ]:
-            served = spaces.served(space, "actions")
-            elements = served.elements(np.array(numbers, np.float32))
+            codec = spaces.codec_of(space, "actions")
+            elements = codec.decode(np.array(numbers, np.float32))
             for element in elements:
                 self.assertTrue(space.contains(element), f"{element!r} is not in {space}")
-        counted = spaces.served(gym.spaces.Box(0, 3, (1,), np.int64), "actions")
-        self.assertEqual(counted.elements(np.array([2.6], np.float32)).tolist(), [[3]])
+        counted = spaces.codec_of(gym.spaces.Box(0, 3, (1,), np.int64), "actions")
+        self.assertEqual(counted.decode(np.array([2.6], np.float32)).tolist(), [[3]])
         with self.assertRaises(ValueError):
-            counted.elements(np.array([np.nan], np.float32))
+            counted.decode(np.array([np.nan], np.float32))
 
     def test_an_evaluation_resets_each_environment_once_for_each_of_its_episodes(self) -> None:
         environments, blocks = self.make(count=2)
         environments.begin_evaluation(10, 3, blocks)
-        Told.step_result = (np.ones(3), 1.0, True, False, {})
+        ScriptedEnvironment.step_result = (np.ones(3), 1.0, True, False, {})
         seeds = []
         for _ in range(4):
             self.step(environments, blocks)
-        seeds = [given for given in Told.given if isinstance(given, int)]
+        seeds = [given for given in ScriptedEnvironment.given if isinstance(given, int)]
         self.assertEqual(len(seeds), 3)
         self.assertEqual(blocks.terminated.tolist(), [0.0, 0.0], "all its episodes are over")
-        Told.given = []
+        ScriptedEnvironment.given = []
         environments.begin_evaluation(10, 0, blocks)
         for _ in range(4):
             self.step(environments, blocks)
-        unlimited = [given for given in Told.given if isinstance(given, int)]
+        unlimited = [given for given in ScriptedEnvironment.given if isinstance(given, int)]
         self.assertEqual(len(unlimited), 10)
         self.assertEqual(unlimited[:3], seeds, "the same episodes")
 
@@ -177,8 +178,8 @@ class Given(unittest.TestCase):
         environments, blocks = self.make()
         for episode in range(200):
             environments.begin_training(episode, blocks)
-        self.assertEqual(len(set(Told.given)), 200)
-        self.assertTrue(all(0 <= seed < SEEDS for seed in Told.given))
+        self.assertEqual(len(set(ScriptedEnvironment.given)), 200)
+        self.assertTrue(all(0 <= seed < SEEDS for seed in ScriptedEnvironment.given))
 
     def test_a_process_draws_alike_at_each_start_and_knows_its_number(self) -> None:
         def drawn(seed: int) -> tuple[float, float]:

@@ -25,7 +25,7 @@ def batch(*rows):
 
 def grouped(rows, before=None):
     before = episodes.rows_before(rows) if before is None else before
-    return [places.tolist() for places in episodes.group_by_episode(rows, before)]
+    return [indices.tolist() for indices in episodes.group_by_episode(rows, before)]
 
 
 class Rows(unittest.TestCase):
@@ -33,6 +33,10 @@ class Rows(unittest.TestCase):
         # The third episode is cut: the next row begins elsewhere, and the last one is under way.
         rows = batch((1, 2, 0), (2, 3, 1), (1, 2, 1), (5, 6, 0), (1, 2, 0), (2, 3, 0))
         self.assertEqual(grouped(rows, np.arange(6) - 1), [[0, 1], [2], [3], [4, 5]])
+
+    def test_an_episode_that_begins_where_one_was_cut_continues_it(self) -> None:
+        rows = batch((1, 2, 0), (2, 1, 0), (1, 2, 0), (2, 3, 1))
+        self.assertEqual(grouped(rows, np.arange(4) - 1), [[0, 1, 2, 3]])
 
     def test_interleaved_rows_follow_their_observations(self) -> None:
         rows = batch((10, 11, 0), (20, 21, 0), (11, 12, 0), (21, 22, 1), (30, 31, 0), (12, 13, 1), (31, 32, 0))

@@ -71,7 +71,7 @@ class Written(unittest.TestCase):
         return environments, Blocks.of(response, 1, 3)
 
     def step(self, environments: Environments, blocks: Blocks) -> None:
-        environments.step(environments.action.elements(np.zeros(1, np.float32)), blocks)
+        environments.step(environments.action.decode(np.zeros(1, np.float32)), blocks)
 
     def taken(self) -> tuple[dict[str, Any], NDArray[np.uint8]]:
         line, pixels = self.file.read_bytes().split(b"\n", 1)

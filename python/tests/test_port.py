@@ -54,7 +54,7 @@ class MakePort(unittest.TestCase):
         self.assertEqual(self._pauses, 0)
         self.assertLess(time.monotonic() - begun, port.TIMEOUT / 2)
 
-    def test_a_port_is_had_once_its_holder_is_gone(self) -> None:
+    def test_a_port_is_made_once_its_holder_is_gone(self) -> None:
         self._made = self._builder().max_servers(1).create()
         holders = [self._made.server_builder().create()]
 
@@ -69,10 +69,10 @@ class MakePort(unittest.TestCase):
         self.assertEqual(self._pauses, 3)
         del made
 
-    def test_a_service_that_is_not_there_is_final(self) -> None:
+    def test_a_missing_service_is_refused_at_once(self) -> None:
         self._refused_at_once(lambda: self._builder().open(), "DoesNotExist")
 
-    def test_a_service_of_another_type_is_final(self) -> None:
+    def test_a_service_of_another_type_is_refused_at_once(self) -> None:
         self._made = self._builder().create()
         other = lambda: self._builder(ResponseHeader).open()  # noqa: E731
         self._refused_at_once(other, "IncompatibleRequestOrResponseType")
@@ -99,7 +99,7 @@ class Heartbeats(unittest.TestCase):
 
         served = port.Port.__new__(port.Port)
         served._heartbeat = Heartbeat()
-        served._heartbeat_port, served._beaten = Sink(), -port.BEAT
+        served._heartbeat_port, served._last_heartbeat_at = Sink(), -port.HEARTBEAT_INTERVAL
         for _ in range(300):
             served.count(4)
         self.assertEqual(told, [4, port.PROVEN])

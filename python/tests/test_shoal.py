@@ -164,7 +164,9 @@ class Files(unittest.TestCase):
 class Settings(unittest.TestCase):
     def test_values_become_the_texts_that_the_option_takes(self) -> None:
         values = {"a.b": True, "a.c": 0.5, "a.d": [400, 300], "a.e": ["x", 1], "a.f": "tanh", "a.g": {"k": "v"}}
+        values |= {"a.h": {"😀": ["é\n"]}, "a.i": ["\x7f\x00"]}
         texts = ["a.b=true", "a.c=0.5", "a.d=[400, 300]", 'a.e=["x", 1]', "a.f=tanh", 'a.g={"k" = "v"}']
+        texts += ['a.h={"😀" = ["é\\n"]}', 'a.i=["\\u007f\\u0000"]']
         self.assertEqual(program.settings(values)[1::2], texts)
 
     def test_values_of_numpy_are_taken_as_their_numbers(self) -> None:

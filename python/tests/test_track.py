@@ -26,9 +26,10 @@ class Recorder:
 
     told: dict = {}
 
-    def __init__(self, run, project, group, begun, known) -> None:
-        self.id = known or f"{project}/{group}/{run.path.name}"
+    def __init__(self, run, project, group, begun, tracker_id) -> None:
+        self.id = tracker_id or f"{project}/{group}/{run.path.name}"
         self.mine = Recorder.told.setdefault(self.id, {"metrics": [], "states": [], "results": [], "settings": {}})
+        self.mine["begun"] = begun
 
     def settings(self, settings) -> None:
         self.mine["settings"].update(settings)
@@ -137,6 +138,31 @@ class Track(unittest.TestCase):
         (run / "tracking-recorder.json").write_text("")
         with self.assertRaisesRegex(shoal.ShoalError, "tracking-recorder.json is damaged; remove it"):
             track.track(run, "recorder")
+
+    def test_the_times_of_metrics_count_from_the_start_of_the_run(self) -> None:
+        run = self.make("run")
+        (run / "start.json").write_text(json.dumps({"format": 1, "started": 1_700_000_000}))
+        track.track(run, "recorder")
+        (run / "start.json").unlink()
+        track.track(run, "recorder")
+        earlier = self.make("earlier")
+        os.utime(earlier / "config.toml", (5.0, 5.0))
+        track.track(earlier, "recorder")
+        self.assertEqual([told["begun"] for told in Recorder.told.values()], [1_700_000_000, 5.0])
+        damaged = self.make("damaged")
+        (damaged / "start.json").write_text("{}")
+        with self.assertRaisesRegex(shoal.ShoalError, "start.json is damaged; remove it"):
+            track.track(damaged, "recorder")
+
+    def test_an_error_of_a_tracker_is_one_line(self) -> None:
+        def fail(*_) -> None:
+            raise RuntimeError("nobody\nanswers")
+
+        run = self.make("run")
+        for method in ("__init__", "settings", "metrics", "files", "close"):
+            with unittest.mock.patch.object(Recorder, method, fail):
+                with self.assertRaisesRegex(shoal.ShoalError, "^recorder: nobody answers$"):
+                    track.track(run, "recorder")
 
     def test_what_is_no_tracker_or_run_is_refused(self) -> None:
         for path, to, message in [("run", "tensorflow", "no tracker"), ("nothing", "recorder", "not a run directory")]:

@@ -25,10 +25,10 @@ def same(a, b):
     return a.dtype == b.dtype == np.float32 and a.tobytes() == b.tobytes()
 
 
-def lines(batch, places):
+def lines(batch, indices):
     """Rows of the replay, as sorted bits."""
     columns = [batch.observation, batch.action, batch.reward[:, None], batch.discount[:, None], batch.next_observation]
-    return sorted(line.tobytes() for line in np.hstack([*columns, batch.last[:, None].astype(np.float32)])[places])
+    return sorted(line.tobytes() for line in np.hstack([*columns, batch.last[:, None].astype(np.float32)])[indices])
 
 
 def check(run, name, gamma, discrete=False):
@@ -36,11 +36,11 @@ def check(run, name, gamma, discrete=False):
     dataset = minari.load_dataset(name)
     found = episodes.episodes(run)
     batch = found.batch
-    assert dataset.total_episodes == len(found.places) and dataset.total_steps == len(batch) > 0
-    assert sorted(np.concatenate(found.places).tolist()) == list(range(len(batch))), "each row once"
+    assert dataset.total_episodes == len(found.indices) and dataset.total_steps == len(batch) > 0
+    assert sorted(np.concatenate(found.indices).tolist()) == list(range(len(batch))), "each row once"
     written = []
-    for episode, places in zip(dataset.iterate_episodes(), found.places, strict=True):
-        steps = len(places)
+    for episode, indices in zip(dataset.iterate_episodes(), found.indices, strict=True):
+        steps = len(indices)
         assert len(episode.observations) == steps + 1 and len(episode.rewards) == steps
         observations = np.asarray(episode.observations).reshape(steps + 1, -1)
         if discrete:
@@ -49,13 +49,13 @@ def check(run, name, gamma, discrete=False):
             actions = actions.astype(np.float32).reshape(steps, -1)
         else:
             actions = np.asarray(episode.actions).reshape(steps, -1)
-        assert same(observations[:-1], batch.observation[places])
-        assert same(observations[1:], batch.next_observation[places])
-        assert same(actions, batch.action[places]) and same(episode.rewards, batch.reward[places])
+        assert same(observations[:-1], batch.observation[indices])
+        assert same(observations[1:], batch.next_observation[indices])
+        assert same(actions, batch.action[indices]) and same(episode.rewards, batch.reward[indices])
         assert not (episode.terminations | episode.truncations)[:-1].any(), "an episode ends with its last row"
-        assert np.array_equal(episode.terminations | episode.truncations, batch.last[places])
-        assert np.array_equal(episode.terminations, batch.discount[places] == 0)
-        assert np.array_equal(episode.truncations, batch.last[places] & (batch.discount[places] != 0))
+        assert np.array_equal(episode.terminations | episode.truncations, batch.last[indices])
+        assert np.array_equal(episode.terminations, batch.discount[indices] == 0)
+        assert np.array_equal(episode.truncations, batch.last[indices] & (batch.discount[indices] != 0))
         discount = np.where(episode.terminations, 0, gamma).astype(np.float32)[:, None]
         ends = (episode.terminations | episode.truncations).astype(np.float32)[:, None]
         rows = [observations[:-1], actions, np.asarray(episode.rewards)[:, None], discount, observations[1:], ends]
@@ -159,7 +159,7 @@ environment = dataset.recover_environment()
 assert environment.spec.id == "CartPole-v1" and environment.spec.max_episode_steps == 40
 assert environment.observation_space.shape == dataset.observation_space.shape
 again = shoal.train("gym:CartPole-v1", run="again", steps=100, set=QUICK, demonstrations="cart/random-v0", quiet=True)
-kept = [place for places in episodes.episodes(cart).places for place in places.tolist()]
+kept = [index for indices in episodes.episodes(cart).indices for index in indices.tolist()]
 expected = cart.transitions().copy()
 order = shoal.transitions.Batch(*(getattr(expected, field)[kept] for field in expected.__dataclass_fields__))
 equal(first_rows(again, 1_500), order)
