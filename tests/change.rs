@@ -1,5 +1,4 @@
-//! The configuration of a run changes when it is resumed: by `--set`, by a hand that edits `config.toml`, and by
-//! `scale`.
+//! The configuration of a run changes when it is resumed: by `--set`, by an edit of `config.toml`, and by `scale`.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -115,7 +114,7 @@ fn rates_change_with_the_run_and_each_change_is_recorded_once() {
 }
 
 #[test]
-fn what_cannot_change_is_refused_by_the_name_of_its_key() {
+fn a_change_that_is_not_possible_is_refused_and_its_key_named() {
     let place = Workplace::new();
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
     let run = &place.path().join("run");
@@ -447,7 +446,7 @@ fn a_lockstep_run_has_the_same_bits_after_the_same_change_at_the_same_step() {
 }
 
 #[test]
-fn all_actors_send_as_many_chunks_also_in_a_last_round_that_is_cut() {
+fn all_actors_send_the_same_number_of_chunks_even_in_a_shortened_last_round() {
     let place = Workplace::new();
     place.train(&[&["pendulum", "--steps", "408", "--run", "run"][..], &LOCKSTEP].concat());
     let commits = CommitReader::open(&place.path().join("run/replay.bin")).unwrap();

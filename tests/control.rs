@@ -145,7 +145,7 @@ fn a_stop_stores_everything_sent_even_if_the_learner_is_far_behind() {
     let place = Workplace::logging_chunks();
     let slow = ["--set", "replay.warmup=64", "--set", "actors.chunk_steps=64"];
     let running = place.start_as("run", &[&ENDLESS[..], &slow].concat());
-    // Two windows of 512 rows, which the learner needs more than a second for.
+    // The learner needs more than a second for two windows of 512 rows.
     until("the actors wait", || {
         let sent = support::sent(&running.run, 0);
         sent >= support::committed(&running.run, 0) + 512 && support::sent(&running.run, 1) > 0
@@ -380,7 +380,7 @@ fn a_detached_run_has_a_session_of_its_own_and_works_when_the_command_returns() 
 }
 
 #[test]
-fn what_cannot_start_is_refused_in_the_terminal_and_leaves_no_run() {
+fn a_detached_run_that_cannot_start_is_refused_in_the_terminal_and_leaves_nothing() {
     let place = Workplace::new();
     for (limit, option, code, message) in [
         ("true", "--set=ddpg.tao=1", 2, "did you mean `tau`"),

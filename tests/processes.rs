@@ -208,9 +208,9 @@ fn a_run_whose_files_in_tmp_are_removed_loses_nothing_and_continues() {
     running.wait_for_learning();
     assert!(place.status("run")["env_steps"].as_u64().unwrap() > 0);
 
-    // Only files, as a program does that tidies up by age; and a role that must be replaced.
+    // Only the files are removed, as by a program that deletes old files, and a role must be replaced.
     running.signal(Signal::STOP);
-    // It complains if a file is gone before it gets there.
+    // `find` fails if a file disappears before it reaches it.
     let find = Command::new("find").arg(&root).args(["-type", "f", "-delete"]).output();
     assert!(find.is_ok(), "{find:?}");
     running.kill("actor-0");

@@ -32,7 +32,7 @@ fn main() -> ExitCode {
             NAMESPACE
         ),
         test!(memory_promised_to_another_run_is_not_free, NAMESPACE),
-        test!(what_another_run_left_and_cannot_be_removed_hinders_no_start, NAMESPACE),
+        test!(leftovers_that_cannot_be_removed_do_not_prevent_a_start, NAMESPACE),
         test!(a_full_disk_is_reported_before_anything_is_created, NAMESPACE),
         test!(a_disk_that_fills_up_ends_the_run_with_one_line, NAMESPACE),
         test!(a_read_only_directory_is_reported, NAMESPACE),
@@ -181,7 +181,7 @@ fn the_default_run_fits_into_a_container_and_one_with_64_actors_is_refused() {
     assert!(!place.path().join("large").exists(), "nothing was created");
 }
 
-fn what_another_run_left_and_cannot_be_removed_hinders_no_start() {
+fn leftovers_that_cannot_be_removed_do_not_prevent_a_start() {
     let place = Workplace::new();
     // A directory that something is mounted on cannot be removed.
     let left = "left=/tmp/shoal-$(id -u)/left; mkdir $left; mount -t tmpfs tmpfs $left";

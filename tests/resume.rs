@@ -119,9 +119,9 @@ fn a_run_is_not_removed_before_the_last_role_of_its_killed_launcher_has_ended() 
     let running = place.start("run", &ENDLESS);
     let run = running.run.clone();
     wait_for_checkpoints(&running);
-    // For a role that does not end, as above.
+    // This process stands for a role that does not end, as in the test above.
     let config = Config::load(&run.join("config.toml")).unwrap();
-    let role = Domain::join(&config.run.id, config.actors.max).unwrap();
+    let role = Domain::join(&config.run.id, config.actors.max_on_a_host()).unwrap();
     running.kill_all();
     let before = contents(&run);
     let message = error_line(&place.output(&["rm", "--yes", "run"]));

@@ -465,7 +465,7 @@ fn a_failed_run_does_not_stop_the_others() {
 }
 
 #[test]
-fn what_is_no_suite_is_refused_before_anything_is_made() {
+fn invalid_suite_arguments_are_refused_before_anything_is_created() {
     let place = Workplace::new();
     for (arguments, part) in [
         (&["--seeds", "5..1"][..], "must look like 1..5"),

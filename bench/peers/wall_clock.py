@@ -20,6 +20,7 @@ object.
 import argparse
 import csv
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -177,8 +178,18 @@ def main():
         for who, reached in times.items()
     }
     ratio = medians["stable_baselines3"] / medians["shoal"]
-    figures = {"threshold": THRESHOLD, "seconds_and_steps": times, "median_seconds": medians, "times_as_fast": ratio}
+    figures = {
+        "threshold": THRESHOLD,
+        "seconds_and_steps": times,
+        "median_seconds": {who: finite(median) for who, median in medians.items()},
+        "times_as_fast": finite(ratio),
+    }
     print(json.dumps(figures))
+
+
+def finite(number):
+    """The number, or None for a number that JSON does not have."""
+    return number if math.isfinite(number) else None
 
 
 if __name__ == "__main__":

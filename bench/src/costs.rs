@@ -103,7 +103,7 @@ pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<C
     })?;
 
     let environment_step_us = environment_step(config, each, budget)?;
-    let round_trip_us = temporary.with_peer(Role::EnvServer, |domain, server| {
+    let round_trip_us = temporary.with_role(Role::EnvServer, |domain, server| {
         round_trip(config, domain, server, &mut inference, each, budget)
     })?;
     let mut replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;

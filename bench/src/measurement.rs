@@ -52,10 +52,14 @@ pub(super) fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
 impl TimeBudget {
     pub(super) fn new() -> anyhow::Result<Self> {
         let seconds = match std::env::var(SECONDS) {
-            Ok(text) => text.parse().ok().filter(|seconds| (0.01..=600.0).contains(seconds)),
-            Err(_) => Some(DEFAULT_SECONDS),
+            Ok(text) => {
+                let seconds = text.parse::<f64>().ok();
+                seconds
+                    .filter(|seconds| (0.01..=600.0).contains(seconds))
+                    .with_context(|| format!("{SECONDS}={text:?}: must be a number of seconds from 0.01 to 600"))?
+            }
+            Err(_) => DEFAULT_SECONDS,
         };
-        let seconds = seconds.with_context(|| format!("{SECONDS} must be a number of seconds from 0.01 to 600"))?;
         let stop = Stop::default();
         let flag = stop.clone();
         let signals = Signals::register()?;
@@ -87,9 +91,15 @@ pub(super) fn print(figures: &impl Figures, json: bool) -> anyhow::Result<()> {
     for (what, how_much) in figures.lines() {
         table.add_row([what, &how_much]);
     }
-    if json {
+    let json = json.then(|| serde_json::to_string(figures)).transpose()?;
+    print_table(&table, json)
+}
+
+/// Prints the table, or with `json` the table to standard error and that line to standard output.
+pub(super) fn print_table(table: &Table, json: Option<String>) -> anyhow::Result<()> {
+    if let Some(json) = json {
         writeln!(std::io::stderr().lock(), "{table}")?;
-        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(figures)?)?;
+        writeln!(std::io::stdout().lock(), "{json}")?;
     } else {
         writeln!(std::io::stdout().lock(), "{table}")?;
     }

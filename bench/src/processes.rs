@@ -22,32 +22,33 @@ impl Processes {
                 index,
                 incarnation,
             };
-            let peer = ChildProcess::of_instance(instance, run)?;
+            let process = ChildProcess::of_instance(instance, run)?;
             if let Some(cores) = cores_for(role) {
-                peer.pin(&cores)?;
+                process.pin(&cores)?;
             }
-            processes.0.push((role, peer));
+            processes.0.push((role, process));
         }
         Ok(processes)
     }
 
     /// Returns an error, with the last output of the process, if one of them has ended.
     pub(super) fn check(&mut self) -> anyhow::Result<()> {
-        self.0.iter_mut().try_for_each(|(_, peer)| peer.check())
+        self.0.iter_mut().try_for_each(|(_, process)| process.check())
     }
 
     /// Calls `act` while all processes except the learner are stopped.
     pub(super) fn with_actors_paused<T>(&self, act: impl FnOnce() -> T) -> anyhow::Result<T> {
         let all_but_the_learner = || self.0.iter().filter(|(role, _)| *role != Role::Learner);
-        let paused = all_but_the_learner().try_for_each(|(_, peer)| peer.pause());
-        let acted = paused.is_ok().then(act);
+        let paused = all_but_the_learner().try_for_each(|(_, process)| process.pause());
+        let acted = paused.map(|()| act());
         // Even after an error, because a stopped process would not end.
         let mut resumed = Ok(());
-        for (_, peer) in all_but_the_learner() {
-            resumed = resumed.and(peer.resume());
+        for (_, process) in all_but_the_learner() {
+            resumed = resumed.and(process.resume());
         }
-        paused.and(resumed)?;
-        acted.ok_or_else(|| anyhow::anyhow!(super::measurement::INTERRUPTED))
+        let acted = acted?;
+        resumed?;
+        Ok(acted)
     }
 
     /// Asks all processes to end and waits for them. The actors end first, so that the learner still receives what they
@@ -56,9 +57,9 @@ impl Processes {
         let mut ended = Ok(());
         for now in [Role::Actor, Role::EnvServer, Role::Learner] {
             let (mut leaving, staying): (Vec<_>, Vec<_>) = self.0.into_iter().partition(|(role, _)| *role == now);
-            leaving.iter_mut().for_each(|(_, peer)| peer.ask_to_end());
-            for (_, peer) in leaving {
-                ended = ended.and(peer.end());
+            leaving.iter_mut().for_each(|(_, process)| process.ask_to_end());
+            for (_, process) in leaving {
+                ended = ended.and(process.end());
             }
             self.0 = staying;
         }

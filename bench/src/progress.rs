@@ -1,5 +1,6 @@
 //! The progress of a measured run: rows from its commit record, gradient steps from the published policies.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
@@ -15,8 +16,8 @@ use super::temporary_run::TemporaryRun;
 /// Time between two polls.
 pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Longest wait until every actor has sent rows.
-const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
+/// How long processes may take to be ready.
+pub(super) const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The counters of a run in which every actor sends rows.
 #[derive(Debug)]
@@ -36,31 +37,25 @@ impl<'a> RunProgress<'a> {
     ) -> anyhow::Result<Self> {
         let policies = policy_reader(&temporary.config, domain)?;
         let begun = Instant::now();
-        let mut commits = None;
-        loop {
+        let commits = wait_for_replay(&temporary.run.replay_file(), || {
+            processes.check()?;
+            budget.check()
+        })?;
+        // The handshake has sequence number 0.
+        let has_sent = |actor: u32| commits.committed(actor as usize).sequence > 0;
+        while !(0..temporary.config.actors.count).all(has_sent) {
             processes.check()?;
             budget.check()?;
-            if commits.is_none() {
-                commits = CommitReader::open_if_ready(&temporary.run.replay_file())?;
-            }
-            // The handshake has sequence number 0.
-            let has_sent = |commits: &CommitReader, actor: u32| commits.committed(actor as usize).sequence > 0;
-            let all = 0..temporary.config.actors.count;
-            match commits.take() {
-                Some(commits) if all.clone().all(|actor| has_sent(&commits, actor)) => {
-                    return Ok(Self {
-                        temporary,
-                        commits,
-                        policies,
-                    });
-                }
-                other => commits = other,
-            }
             if begun.elapsed() >= STARTUP_TIMEOUT {
                 bail!("not every actor had sent rows after {} s", STARTUP_TIMEOUT.as_secs());
             }
             std::thread::sleep(POLL_INTERVAL);
         }
+        Ok(Self {
+            temporary,
+            commits,
+            policies,
+        })
     }
 
     /// Rows committed.
@@ -90,6 +85,24 @@ impl<'a> RunProgress<'a> {
     /// Whether the run's learner makes gradient steps.
     pub(super) fn expects_updates(&self) -> bool {
         self.temporary.config.replay.updates_per_step > 0.0
+    }
+}
+
+/// Waits for a replay, or for a copy of its commit record. `check` ends the wait by an error.
+pub(super) fn wait_for_replay(
+    path: &Path,
+    mut check: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<CommitReader> {
+    let begun = Instant::now();
+    loop {
+        if let Some(reader) = CommitReader::open_if_ready(path)? {
+            return Ok(reader);
+        }
+        if begun.elapsed() >= STARTUP_TIMEOUT {
+            bail!("{} was not made within {} s", path.display(), STARTUP_TIMEOUT.as_secs());
+        }
+        check()?;
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 

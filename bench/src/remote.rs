@@ -31,17 +31,17 @@ const WINDOW: u32 = 64;
 /// Bits a second of the limited cable.
 const FAST_CABLE: u64 = 1_000_000_000;
 
-/// What a gigabit a second carries of rows of Pendulum in chunks, 64 × 40 bytes and a header, with TCP's and IP's own
-/// headers.
+/// Rows of Pendulum that 1 Gbit/s carries in a second. A chunk has 64 × 40 bytes and a header, besides the headers of
+/// TCP and IP.
 const GIGABIT_ROWS: f64 = 2.84e6;
 
 /// Bits a second of the cable over which the model is compared with measurements.
 const SLOW_CABLE: u64 = 100_000_000;
 
-/// The numbers of actors for which it is compared.
+/// Numbers of actors at which the model is compared with measurements.
 const MODELLED_ACTORS: [u32; 4] = [1, 2, 4, 8];
 
-/// The time in which each of them fills a chunk.
+/// The time in which an actor fills a chunk in these measurements.
 const FILL_TIME: Duration = Duration::from_millis(1);
 
 /// The default of `actors.window`.
@@ -53,22 +53,26 @@ const POLICY_BYTES: f64 = 488_804.0;
 /// Policies that a learner publishes a second: every fourth of 600 gradient steps makes one.
 const PUBLISHED_PER_SECOND: f64 = 150.0;
 
-/// Hosts that join one gate, and the actors of each: as many as have services of their own, and as many as share one.
+/// Hosts that join one gate, and actors of each. In the first case each actor has a service of its own, in the second
+/// all share one.
 const MANY_HOSTS: (u32, u32) = (32, 8);
 const MOST_HOSTS: (u32, u32) = (32, 32);
 
-/// Hosts and actors of each for which the model alone is asked.
+/// Hosts, and actors of each, whose rate only the model predicts.
 const MODELLED_HOSTS: (u32, u32) = (32, 32);
 
-/// The first pause of the cable, and by how much each is longer than the one before.
+/// Length of the first outage, and by how much each is longer than the one before.
 const SHORTEST_OUTAGE: Duration = Duration::from_millis(1_000);
 const OUTAGE_STEP: Duration = Duration::from_millis(700);
+
+/// Outages have this many different lengths.
+const OUTAGE_LENGTHS: u32 = 9;
 
 /// How long rows may take to come back.
 const RETURN_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Shares of the time: each of the rates, the outages, each number of many hosts, and each rate that the model predicts. A tenth
-/// of each warms up.
+/// Shares of the time: each link's rate, the outages, each measurement with many hosts, and each rate that the model
+/// predicts. A tenth of each is the warm-up.
 const SHARES: [f64; 4] = [0.2, 0.2, 0.1, 0.15];
 const WARM_UP: f64 = 0.1;
 
@@ -187,7 +191,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
 fn temporary_run(actors: u32, window: u32) -> anyhow::Result<TemporaryRun> {
     let (most, window) = (format!("actors.max={actors}"), format!("actors.window={window}"));
     TemporaryRun::of(
-        // All actors are of other hosts, but a run has one of its own.
+        // The measured actors belong to other hosts, but a run must have one of its own.
         1,
         1,
         &[
@@ -208,7 +212,12 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
         run.send_for(length.mul_f64(WARM_UP))?;
         // On a busy machine, a short warm-up may end before the first rows arrive.
         let before = run.rows();
-        run.send_until(RETURN_TIMEOUT, |run| run.rows() > before)?;
+        if !run.send_until(RETURN_TIMEOUT, |run| run.rows() > before)? {
+            anyhow::bail!(
+                "no rows of the joined host arrived within {} s",
+                RETURN_TIMEOUT.as_secs()
+            );
+        }
         let observed = [run.gate(), run.relay(), run.learner()];
         let busy = || -> anyhow::Result<_> { observed.into_iter().map(usage::busy).collect() };
         let before: Vec<Duration> = busy()?;
@@ -232,7 +241,7 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
     })
 }
 
-/// Unplugs the cable several times, each time for longer.
+/// Unplugs the cable several times, for [`OUTAGE_LENGTHS`] different times in turn.
 fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageFigures> {
     let Network::Cable(cable) = network else {
         anyhow::bail!("only a cable can be unplugged");
@@ -240,11 +249,10 @@ fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> 
     let temporary = temporary_run(ACTORS, WINDOW)?;
     RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
         let mut returned = Samples::default();
-        // Nine for the default length.
         for i in 0..intervals::count(length, 1.0, Duration::from_secs_f64(0.13)) as u32 {
             run.send_for(INTERVAL)?;
             cable.set_plugged(false)?;
-            run.send_for(SHORTEST_OUTAGE + OUTAGE_STEP * i)?;
+            run.send_for(SHORTEST_OUTAGE + OUTAGE_STEP * (i % OUTAGE_LENGTHS))?;
             // Nothing is under way between relay and replay any more.
             let before = run.rows();
             cable.set_plugged(true)?;
@@ -418,8 +426,8 @@ impl ModelFigures {
             mean_age_s,
         } = self.policy_age;
         format!(
-            "{:.1} million rows a second; first limit {station}, by {actors:.0} actors; each host gets {policies_per_second:.1} \
-             policies a second, {mean_age_s:.2} s old",
+            "{:.1} million rows a second; first limit {station}, by {actors:.0} actors; each host gets \
+             {policies_per_second:.1} policies a second, {mean_age_s:.2} s old",
             self.expected_of_many / 1e6
         )
     }

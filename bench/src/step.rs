@@ -22,7 +22,7 @@ use super::temporary_run::TemporaryRun;
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Share of the time that is spent on warming up.
-const WARMUP: f64 = 0.1;
+const WARM_UP: f64 = 0.1;
 
 /// Shares of the time: round trips between two cores, and within one.
 const SHARES: [f64; 2] = [0.6, 0.3];
@@ -51,7 +51,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepFigures> {
     let temporary = TemporaryRun::new(&[])?;
     let mut spins = spin::times(budget.length.mul_f64(SPIN / 2.0));
     let [apart, together] = SHARES.map(|share| budget.length.mul_f64(share));
-    let mut times = temporary.with_peer(Role::EnvServer, |domain, server| {
+    let mut times = temporary.with_role(Role::EnvServer, |domain, server| {
         round_trips(&temporary.config, domain, server, apart, budget)
     })?;
     let mut on_one_core = on_one_core(together, budget)?;
@@ -77,7 +77,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepFigures> {
 fn on_one_core(length: Duration, budget: &TimeBudget) -> anyhow::Result<Vec<u32>> {
     let temporary = TemporaryRun::new(&[])?;
     let cores = Cores::choose()?;
-    temporary.with_peer(Role::EnvServer, |domain, server| {
+    temporary.with_role(Role::EnvServer, |domain, server| {
         server.pin(&cores.pair)?;
         sched_setaffinity(None, &cores.pair)?;
         round_trips(&temporary.config, domain, server, length, budget)
@@ -110,7 +110,7 @@ fn round_trips(
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
-    let warmup = length.mul_f64(WARMUP);
+    let warm_up = length.mul_f64(WARM_UP);
     let (begun, mut looked) = (Instant::now(), Instant::now());
     loop {
         let before = Instant::now();
@@ -124,7 +124,7 @@ fn round_trips(
             Err(Exit::Failed(error)) => return Err(error.into()),
         }
         let after = Instant::now();
-        if before.duration_since(begun) >= warmup {
+        if before.duration_since(begun) >= warm_up {
             times.push((after - before).as_nanos().try_into().unwrap_or(u32::MAX));
         }
         if after - looked >= CHECK_INTERVAL {

@@ -1,12 +1,10 @@
 //! `shoal bench all`: every stage in turn, and one table of the results.
 
-use std::io::Write;
-
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde_json::{Map, Value};
 
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{Figures, TimeBudget, print_table};
 use super::target::Line;
 use super::{actors, learner, policy, step, transitions, whole_run};
 
@@ -45,12 +43,11 @@ pub(super) fn measure_all(json: bool, budget: &TimeBudget) -> anyhow::Result<()>
         let share = line.share.map_or_else(String::new, |share| format!("{share:.2}"));
         table.add_row([line.stage, &line.ours, &line.limit, &share, &line.target.show()]);
     }
-    if json {
+    let json = if json {
         stages.insert("table".into(), serde_json::to_value(&lines)?);
-        writeln!(std::io::stderr().lock(), "{table}")?;
-        writeln!(std::io::stdout().lock(), "{}", Value::Object(stages))?;
+        Some(Value::Object(stages).to_string())
     } else {
-        writeln!(std::io::stdout().lock(), "{table}")?;
-    }
-    Ok(())
+        None
+    };
+    print_table(&table, json)
 }

@@ -105,15 +105,15 @@ impl TemporaryRun {
     }
 
     /// Calls `act` while another process runs as `role` 0 of the run. Leaves nothing of the run in shared memory.
-    pub(super) fn with_peer<T>(
+    pub(super) fn with_role<T>(
         &self,
         role: Role,
         act: impl FnOnce(&Domain, &mut ChildProcess) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         self.in_shared_memory(|domain| {
-            let mut peer = ChildProcess::role(role, &self.run)?;
-            let acted = act(domain, &mut peer);
-            let ended = peer.end();
+            let mut process = ChildProcess::role(role, &self.run)?;
+            let acted = act(domain, &mut process);
+            let ended = process.end();
             let acted = acted?;
             ended?;
             Ok(acted)

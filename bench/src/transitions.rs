@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier, wait_for};
-use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::role::Role;
@@ -18,6 +17,7 @@ use shoal_run::child_process::ChildProcess;
 
 use super::intervals::{self, Samples};
 use super::measurement::{Figures, TimeBudget};
+use super::progress::wait_for_replay;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::{TemporaryRun, UNDISTURBED, ddpg};
@@ -51,7 +51,7 @@ pub(super) struct TransitionFigures {
 pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> {
     let own = ["actors.chunk_steps=64", "replay.updates_per_step=0"];
     let temporary = TemporaryRun::new(&[&own[..], &UNDISTURBED].concat())?;
-    let moved = temporary.with_peer(Role::Learner, |domain, learner| {
+    let moved = temporary.with_role(Role::Learner, |domain, learner| {
         move_rows(&temporary.config, &temporary.run, domain, learner, budget)
     })?;
     let replay = Replay::open(&temporary.run.replay_file(), &temporary.replay_layout())?;
@@ -84,21 +84,26 @@ fn move_rows(
 
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let notifier = Notifier::new(domain, EventName(Role::Learner, 0))?;
-    let commits = wait_for_replay(run, &listener, learner, budget)?;
+    let commits = wait_for_replay(&run.replay_file(), || {
+        learner.check()?;
+        budget.check()
+    })?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
-    let mut sender = handshake
-        .wait(&commits, &listener, &budget.stop, || {
-            // Once the learner has ended, nothing is committed any more.
-            if learner.check().is_err() {
-                budget.stop.request();
-            }
-        })
-        .map_err(super::measurement::interrupted)?;
+    let waited = handshake.wait(&commits, &listener, &budget.stop, || {
+        // Once the learner has ended, nothing is committed any more.
+        if learner.check().is_err() {
+            budget.stop.request();
+        }
+    });
+    if let Err(Exit::Stopped) = waited {
+        learner.check()?;
+    }
+    let mut sender = waited.map_err(super::measurement::interrupted)?;
 
-    let [warmup, moving, _] = SHARES;
+    let [warm_up, moving, _] = SHARES;
     let mut results = Samples::default();
     let mut left = intervals::count(budget.length, moving, INTERVAL);
-    let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warmup), None);
+    let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warm_up), None);
     loop {
         for numbers in &chunks {
             let may_send = || sender.in_flight(commits.committed(0)) < u64::from(config.actors.window);
@@ -139,22 +144,6 @@ fn move_rows(
             budget.check()?;
             (begun, length) = (Instant::now(), INTERVAL);
         }
-    }
-}
-
-fn wait_for_replay(
-    run: &RunDir,
-    listener: &Listener,
-    learner: &mut ChildProcess,
-    budget: &TimeBudget,
-) -> anyhow::Result<CommitReader> {
-    loop {
-        if let Some(reader) = CommitReader::open_if_ready(&run.replay_file())? {
-            return Ok(reader);
-        }
-        learner.check()?;
-        budget.check()?;
-        listener.wait(Duration::from_millis(5))?;
     }
 }
 

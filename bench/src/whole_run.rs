@@ -122,10 +122,10 @@ impl RunFigures {
         Self {
             starts: starts.len(),
             ready_seconds: of_starts(|began| began.ready),
-            warm_up_seconds: of_starts(Startup::warmup),
+            warm_up_seconds: of_starts(Startup::warm_up),
             warm_up_rows: starts.first().map_or(0, |began| began.warm_up_rows),
             first_update_seconds: of_starts(|began| began.update.saturating_sub(began.warm)),
-            start_seconds: of_starts(|began| began.update - began.warmup()),
+            start_seconds: of_starts(|began| began.update - began.warm_up()),
             kills: recoveries.len(),
             successor_ready_seconds: Spread::of(recoveries.iter().map(|came| came.ready)),
             recovery_seconds: Spread::of(recoveries.iter().map(|came| came.update)),

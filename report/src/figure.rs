@@ -17,7 +17,7 @@ pub use episode::episode;
 pub use lake::lake;
 pub use learning_curve::learning_curve;
 pub use learning_curves::{learning_curves, quantile};
-pub use lines::{CurvesOfSetting, Frame, lines, lines_by_setting, pointwise};
+pub use lines::{CurvesOfSetting, DiagramAxes, lines, lines_by_setting, pointwise};
 pub use pendulum::swing_up;
 pub use point_mass::{test_runs, trajectories};
 pub use raster::{CAN_RASTERISE, rasterise};

@@ -1,7 +1,7 @@
 //! Films of a policy's evaluation episodes.
 
-mod animation;
 mod ffmpeg;
+mod gif;
 mod paint;
 
 use std::borrow::Cow;
@@ -19,14 +19,14 @@ use shoal_run::evaluation::frames::Frames;
 use shoal_run::evaluation::rollout::Rollout;
 use shoal_run::signals::{self, Interrupt};
 
-use self::animation::Animation;
 use self::ffmpeg::Ffmpeg;
+use self::gif::GifEncoder;
 pub(crate) use self::paint::Painter;
 
-/// Pictures of all episodes of a film, at most about this many; longer episodes are thinned out.
+/// About the greatest number of pictures in a film, over all its episodes. Longer episodes are thinned out.
 const PICTURES_OF_GIF: usize = 300;
 const PICTURES_OF_MP4: usize = 600;
-/// Each episode has at least this many.
+/// The limit for one episode is never below this.
 const FEWEST_PICTURES: usize = 20;
 
 /// Players slow down pictures of a GIF that are shown for less than this many hundredths of a second.
@@ -36,9 +36,9 @@ const MAX_FPS: f64 = 60.0;
 /// How long the last picture of an episode is shown, in s.
 const PAUSE: f64 = 0.6;
 
-/// Steps in a second where nothing says how many there are.
+/// Steps per second if neither the user nor the environment gives a rate.
 const STEPS_PER_SECOND: f64 = 30.0;
-/// Steps in a second where the states are places, such as cells of a grid.
+/// The same for discrete observations, such as the cells of a grid.
 const MOVES_PER_SECOND: f64 = 4.0;
 
 /// The file formats.
@@ -98,6 +98,7 @@ pub struct Shown {
 }
 
 /// Why there is no film: its file cannot be written, or something else.
+#[derive(Debug)]
 enum FilmFailure {
     File(anyhow::Error),
     Other(anyhow::Error),
@@ -109,9 +110,15 @@ impl From<io::Error> for FilmFailure {
     }
 }
 
+impl From<::gif::EncodingError> for FilmFailure {
+    fn from(error: ::gif::EncodingError) -> Self {
+        Self::File(error.into())
+    }
+}
+
 impl From<anyhow::Error> for FilmFailure {
     fn from(error: anyhow::Error) -> Self {
-        if error.is::<gif::EncodingError>() {
+        if error.is::<::gif::EncodingError>() {
             Self::File(error)
         } else {
             Self::Other(error)
@@ -144,7 +151,7 @@ pub fn film(
     let most = (pictures / request.episodes.max(1) as usize).max(FEWEST_PICTURES);
     let mut shown = Shown::default();
     write_atomically(out, |file| {
-        let mut writer: Option<Writer<'_, _>> = None;
+        let mut writer: Option<FilmWriter<'_, _>> = None;
         let mut file = Some(file);
         for number in 0..request.episodes {
             let steps = |steps| progress(number, steps);
@@ -167,13 +174,13 @@ pub fn film(
                 Some(writer) => writer,
                 None => {
                     let file = file.take().context("the film was begun twice")?;
-                    writer.insert(Writer::new(file, format, size, rate)?)
+                    writer.insert(FilmWriter::new(file, format, size, rate)?)
                 }
             };
             shown.seconds += writer.add(&mut pictures, steps, rate, interrupt)?;
             shown.episodes.push((trajectory.episode_return(), steps));
         }
-        Ok(writer.context("there is no episode")?.finish(interrupt)?)
+        writer.context("there is no episode")?.finish(interrupt)
     })
     .map_err(|failure| match failure {
         FilmFailure::File(error) => error.context(format!(
@@ -193,7 +200,7 @@ struct Pictures<'a> {
     size: Option<(usize, usize)>,
     /// The picture that was asked for last, and its number.
     last: Option<(usize, Cow<'a, Image>)>,
-    /// Drawings that the painter knows: each adds to the trail.
+    /// The number of drawings that the painter has been given. Each extends the trail.
     drawn: usize,
 }
 
@@ -243,31 +250,35 @@ impl<'a> Pictures<'a> {
 }
 
 /// Writes pictures in either format.
-struct Writer<'a, W: Write> {
+struct FilmWriter<'a, W: Write> {
     size: (usize, usize),
     /// Hundredths of a second that rounding has left over.
     left_over: f64,
-    to: To<'a, W>,
+    encoder: Encoder<'a, W>,
 }
 
-enum To<'a, W: Write> {
-    Gif(Animation<&'a mut W>),
+enum Encoder<'a, W: Write> {
+    Gif(GifEncoder<&'a mut W>),
     Mp4 { file: &'a mut W, ffmpeg: Ffmpeg, fps: f64 },
 }
 
-impl<'a, W: Write> Writer<'a, W> {
+impl<'a, W: Write> FilmWriter<'a, W> {
     fn new(file: &'a mut W, format: Format, size: (usize, usize), rate: f64) -> anyhow::Result<Self> {
-        let to = match format {
-            Format::Gif => To::Gif(Animation::new(file, size)?),
+        let encoder = match format {
+            Format::Gif => Encoder::Gif(GifEncoder::new(file, size)?),
             Format::Mp4 => {
                 // A whole number of steps per picture.
                 let fps = rate / (rate / MAX_FPS).ceil().max(1.0);
                 let ffmpeg = Ffmpeg::start(size, fps)?;
-                To::Mp4 { file, ffmpeg, fps }
+                Encoder::Mp4 { file, ffmpeg, fps }
             }
         };
         let left_over = 0.0;
-        Ok(Self { size, left_over, to })
+        Ok(Self {
+            size,
+            left_over,
+            encoder,
+        })
     }
 
     /// Adds the pictures of an episode, and returns how long they are shown, in s.
@@ -278,11 +289,11 @@ impl<'a, W: Write> Writer<'a, W> {
         rate: f64,
         interrupt: &Interrupt,
     ) -> anyhow::Result<f64> {
-        // That of the episodes before.
+        // Every episode must have the size of the first.
         pictures.size = Some(self.size);
         let (stride, last) = (pictures.frames.stride, pictures.len() - 1);
-        match &mut self.to {
-            To::Gif(animation) => {
+        match &mut self.encoder {
+            Encoder::Gif(gif) => {
                 let every = (SHORTEST_DELAY * rate / 100.0 / stride as f64).ceil().max(1.0) as usize;
                 let mut seconds = 0.0;
                 let shown: Vec<usize> = (0..last).step_by(every).chain([last]).collect();
@@ -295,12 +306,12 @@ impl<'a, W: Write> Writer<'a, W> {
                     let exact = 100.0 * lasts + self.left_over;
                     let delay = exact.round().clamp(SHORTEST_DELAY, f64::from(u16::MAX));
                     self.left_over = (exact - delay).clamp(-SHORTEST_DELAY, SHORTEST_DELAY);
-                    animation.add(pictures.get(*i)?, delay as u16)?;
+                    gif.add(pictures.get(*i)?, delay as u16)?;
                     seconds += delay / 100.0;
                 }
                 Ok(seconds)
             }
-            To::Mp4 { ffmpeg, fps, .. } => {
+            Encoder::Mp4 { ffmpeg, fps, .. } => {
                 let count = ((steps as f64 / rate + PAUSE) * *fps).round().max(1.0) as usize;
                 for n in 0..count {
                     check(interrupt)?;
@@ -313,10 +324,10 @@ impl<'a, W: Write> Writer<'a, W> {
         }
     }
 
-    fn finish(self, interrupt: &Interrupt) -> anyhow::Result<()> {
-        match self.to {
-            To::Gif(animation) => animation.finish(),
-            To::Mp4 { file, ffmpeg, .. } => ffmpeg.finish(file, interrupt),
+    fn finish(self, interrupt: &Interrupt) -> Result<(), FilmFailure> {
+        match self.encoder {
+            Encoder::Gif(gif) => gif.finish(),
+            Encoder::Mp4 { file, ffmpeg, .. } => ffmpeg.finish(file, interrupt),
         }
     }
 }

@@ -83,8 +83,8 @@ fn rankings(comparisons: &[Comparison], runs: &[Run]) -> Vec<Ranking> {
     comparisons.iter().filter_map(of).collect()
 }
 
-/// What the runs' repetitions say about their settings: a line for each, the best first, and how certain that is.
-/// Nothing if nothing was repeated.
+/// Ranks the settings of repeated runs: a line for each setting, the best first, and then how certain the first place
+/// is. Empty if no setting was repeated.
 ///
 /// # Errors
 /// When a run cannot be read.

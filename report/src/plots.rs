@@ -21,14 +21,14 @@ use crate::figure;
 pub struct Drawn {
     /// The files of the figures.
     pub files: Vec<PathBuf>,
-    /// Why an episode is missing among them: a sentence without its full stop. The program that serves the environment
-    /// has failed.
+    /// Why the environment's program could not play an episode, as a sentence without a full stop; `None` if it did not
+    /// fail.
     pub no_episode: Option<String>,
 }
 
-/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. A program that serves
-/// the environment is started only if there is an `interrupt`, which ends its episode. `check` comes before each write:
-/// an episode may take long.
+/// Draws the run's learning curve so far and, if it has a best policy, that policy's behaviour. If another program
+/// serves the environment, it is started only if it has named its signals and there is an `interrupt`, which can end
+/// its episode. `check` is called before each write, because an episode may take long.
 ///
 /// # Errors
 /// When `check` fails, a file cannot be read or written, or the policy does not fit the run.
@@ -78,8 +78,7 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
     Ok(vec![episode(&description::of(config)?, &trajectory, out)?])
 }
 
-/// The first evaluation episode of the run's seed, in an environment that another program serves. It is drawn only if
-/// that program names its signals, because the program is started only for this.
+/// The first evaluation episode of the run's seed, in an environment that another program serves.
 fn episode_of_server(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Trajectory> {
     let policy = SavedPolicy::Best.read(run, config)?;
     let rollout = Rollout::of_run(run, config, &policy.parameters)?;

@@ -4,9 +4,9 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy::Policy;
 use shoal_common::stream::{Purpose, stream};
-use shoal_report::figure::{self, CurvesOfSetting, Frame};
+use shoal_report::figure::{self, CurvesOfSetting, DiagramAxes};
 
-use super::claim::{Claim, Scope, median, percent, spread};
+use super::claim::{Claim, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::report_section::{FigureWriter, ReportSection};
@@ -18,11 +18,11 @@ const SPAN: usize = 100;
 /// The task is solved when the moving average reaches this return.
 const SOLVED: f64 = 195.0;
 
-/// After a drop, a moving average above this return ends it.
-const RECOVERED: f64 = 190.0;
-
 /// After the task was solved, a moving average below this return is a drop in performance.
 const DROPPED: f64 = 150.0;
+
+/// A drop ends when the moving average exceeds this return.
+const RECOVERED: f64 = 190.0;
 
 /// Number of episodes between stored points of the curve.
 const CURVE_INTERVAL: usize = 10;
@@ -64,14 +64,15 @@ const fn experiment(name: &'static str, settings: &'static [&'static str]) -> Ex
     }
 }
 
-/// The history of the training.
+/// What is stored of a training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct TrainingHistory {
     /// (episode, mean return of the last [`SPAN`] episodes), every [`CURVE_INTERVAL`] episodes.
     average: Vec<(u64, f64)>,
     /// The first episode at which the average over [`SPAN`] episodes was at least [`SOLVED`].
     solved: Option<u64>,
-    /// How often the average fell below [`DROPPED`] after that. Between two drops it must have been above [`RECOVERED`].
+    /// How often the average fell below [`DROPPED`] after that. Between two drops it must have been above
+    /// [`RECOVERED`].
     drops: u32,
     /// The share of the episodes from `solved` on at which the average was below [`DROPPED`].
     below: Option<f64>,
@@ -125,15 +126,15 @@ impl TrainingHistory {
             .collect()
     }
 
-    /// Mean of the moving average after episode 1,000.
-    fn late(&self) -> f64 {
+    /// Mean of the moving average after episode 1,000; `None` if the training is shorter.
+    fn late(&self) -> Option<f64> {
         let late = self
             .average
             .iter()
             .filter(|(episode, _)| *episode > 1_000)
             .map(|(_, mean)| *mean);
         let values: Vec<f64> = late.collect();
-        values.iter().sum::<f64>() / values.len().max(1) as f64
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
     }
 }
 
@@ -155,7 +156,7 @@ impl Family for CartPole {
         let settings: Vec<CurvesOfSetting> = variants
             .iter()
             .map(|(label, seeds)| {
-                let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.curve()).collect();
+                let runs: Vec<_> = seeds.iter().map(|seed| seed.measurements.curve()).collect();
                 CurvesOfSetting {
                     label: (*label).into(),
                     curve: figure::pointwise(&runs, median),
@@ -163,7 +164,7 @@ impl Family for CartPole {
                 }
             })
             .collect();
-        let frame = Frame {
+        let axes = DiagramAxes {
             title: "Moving average of the training returns, median over the seeds",
             x: ("episode", EPISODES as f64),
             y: ("return, mean of 100 episodes", 0.0, 210.0),
@@ -174,12 +175,12 @@ impl Family for CartPole {
                 "cart-pole-variants",
                 "Reward history, moving average over 100 episodes: median over the seeds (figure 4.6, and the \
                  baseline)",
-                |path| figure::lines(&frame, &settings, path),
+                |path| figure::lines(&axes, &settings, path),
             )?,
             writer.add(
                 "cart-pole-seeds",
                 "The same for every seed; the thesis shows a single run, which may be like any of these (figure 4.6)",
-                |path| figure::lines_by_setting(&frame, &settings, path),
+                |path| figure::lines_by_setting(&axes, &settings, path),
             )?,
         ];
         Ok(vec![ReportSection {
@@ -232,12 +233,12 @@ fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
 type Seeds<'a> = &'a [SeedResult<TrainingHistory>];
 
 fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim> {
-    let solved = |seeds: Seeds<'_>| seeds.iter().filter_map(|seed| seed.tests.solved).count();
+    let solved = |seeds: Seeds<'_>| seeds.iter().filter_map(|seed| seed.measurements.solved).count();
     // The median first crossing of 195. A seed that never solves the task counts as infinitely late.
     let crossing = |seeds: Seeds<'_>| -> Option<f64> {
         let mut at: Vec<f64> = seeds
             .iter()
-            .map(|seed| seed.tests.solved.map_or(f64::INFINITY, |at| at as f64))
+            .map(|seed| seed.measurements.solved.map_or(f64::INFINITY, |at| at as f64))
             .collect();
         at.sort_by(f64::total_cmp);
         (!at.is_empty()).then(|| median(&at))
@@ -246,44 +247,39 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
         Some(at) if at.is_finite() => format!("{at:.0}"),
         _ => "never".into(),
     };
-    let late = |seeds: Seeds<'_>| spread(seeds.iter().map(|seed| seed.tests.late()), 0);
-    let dead = |seeds: Seeds<'_>| seeds.iter().filter(|seed| seed.tests.dead).count();
+    let late = |seeds: Seeds<'_>| spread(seeds.iter().filter_map(|seed| seed.measurements.late()), 0);
+    let dead = |seeds: Seeds<'_>| seeds.iter().filter(|seed| seed.measurements.dead).count();
     let below = |seeds: Seeds<'_>| -> Option<f64> {
-        let shares: Vec<f64> = seeds.iter().filter_map(|seed| seed.tests.below).collect();
+        let shares: Vec<f64> = seeds.iter().filter_map(|seed| seed.measurements.below).collect();
         (!shares.is_empty()).then(|| shares.iter().sum::<f64>() / shares.len() as f64)
     };
-    let drops = |seeds: Seeds<'_>| -> f64 {
+    let drops = |seeds: Seeds<'_>| -> String {
         let each: Vec<f64> = seeds
             .iter()
-            .filter(|seed| seed.tests.solved.is_some())
-            .map(|seed| f64::from(seed.tests.drops))
+            .filter(|seed| seed.measurements.solved.is_some())
+            .map(|seed| f64::from(seed.measurements.drops))
             .collect();
-        each.iter().sum::<f64>() / each.len().max(1) as f64
+        if each.is_empty() {
+            return "—".into();
+        }
+        format!("{:.1}", each.iter().sum::<f64>() / each.len() as f64)
     };
     let share = |below: Option<f64>| below.map_or_else(|| "—".into(), percent);
-    let together = |thesis, criterion, ours, held: Option<bool>| Claim {
-        thesis,
-        criterion,
-        ours,
-        scope: Scope::Together,
-        held: held.into_iter().collect(),
-    };
-    let solvers = || normalised.iter().filter(|seed| seed.tests.solved.is_some());
+    let solvers = || normalised.iter().filter(|seed| seed.measurements.solved.is_some());
     vec![
-        Claim {
-            thesis: "Without normalisation the task is not even close to solved after 5,000 episodes",
-            criterion: "the mean of 100 episodes never reaches 195",
-            ours: format!(
+        Claim::each_seed(
+            "Without normalisation the task is not even close to solved after 5,000 episodes",
+            "the mean of 100 episodes never reaches 195",
+            format!(
                 "{} of {} seeds reach it; mean return after episode 1,000: {}; dead networks at the end: {}",
                 solved(plain),
                 plain.len(),
                 late(plain),
                 dead(plain)
             ),
-            scope: Scope::EachSeed,
-            held: plain.iter().map(|seed| seed.tests.solved.is_none()).collect(),
-        },
-        together(
+            plain.iter().map(|seed| seed.measurements.solved.is_none()),
+        ),
+        Claim::together(
             "With normalisation the moving average crosses 195 at about episode 800",
             "the median first crossing over the seeds lies between episodes 400 and 1,200",
             format!(
@@ -295,19 +291,18 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
             ),
             crossing(normalised).map(|at| (400.0..=1_200.0).contains(&at)),
         ),
-        Claim {
-            thesis: "Performance drops when training continues beyond this point",
-            criterion: "after crossing 195, the average falls below 150 at least once",
-            ours: format!("{:.1} times, in the mean over the seeds that cross", drops(normalised)),
-            scope: Scope::EachSeed,
-            held: solvers().map(|seed| seed.tests.drops > 0).collect(),
-        },
-        together(
+        Claim::each_seed(
+            "Performance drops when training continues beyond this point",
+            "after crossing 195, the average falls below 150 at least once",
+            format!("{} times, in the mean over the seeds that cross", drops(normalised)),
+            solvers().map(|seed| seed.measurements.drops > 0),
+        ),
+        Claim::together(
             "Not updating where the step limit ended the episode stabilises the training",
             "after the crossing, a smaller share of the episodes has an average below 150, in the mean over the seeds \
              that cross",
             format!(
-                "share below 150: {} instead of {}; drops: {:.1} instead of {:.1}; {} of {} seeds cross, median {}",
+                "share below 150: {} instead of {}; drops: {} instead of {}; {} of {} seeds cross, median {}",
                 share(below(skipping)),
                 share(below(normalised)),
                 drops(skipping),
@@ -320,7 +315,7 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
                 .zip(below(normalised))
                 .map(|(with, without)| with < without),
         ),
-        together(
+        Claim::together(
             "A baseline would reduce the variance, and could decrease the convergence time",
             "the median first crossing is earlier than with plain returns",
             format!(
@@ -364,12 +359,16 @@ mod tests {
             (150, 0.0),
             (450, 200.0),
         ]);
-        let tests = TrainingHistory::of(&returns, false);
+        let measurements = TrainingHistory::of(&returns, false);
         // The first mean of at least 195 has 98 episodes of 200 and 2 of 20.
-        assert_eq!(tests.solved, Some(598));
-        assert_eq!(tests.drops, 2);
-        assert!((0.2..0.5).contains(&tests.below.unwrap()), "{:?}", tests.below);
-        assert_eq!((tests.average.len(), tests.average[0]), (200, (10, 20.0)));
+        assert_eq!(measurements.solved, Some(598));
+        assert_eq!(measurements.drops, 2);
+        assert!(
+            (0.2..0.5).contains(&measurements.below.unwrap()),
+            "{:?}",
+            measurements.below
+        );
+        assert_eq!((measurements.average.len(), measurements.average[0]), (200, (10, 20.0)));
         let never = TrainingHistory::of(&history(&[(600, 30.0)]), true);
         assert_eq!((never.solved, never.below, never.drops), (None, None, 0));
         assert_eq!(
@@ -390,11 +389,25 @@ mod tests {
         let held = |claims: Vec<Claim>| -> Vec<bool> {
             claims
                 .into_iter()
-                .map(|claim| claim.held.iter().all(|held| *held) && !claim.held.is_empty())
+                .map(|claim| claim.held().iter().all(|held| *held) && !claim.held().is_empty())
                 .collect()
         };
         assert_eq!(held(claims([&fails, &shaky, &steady, &steady])), [true; 5]);
         assert_eq!(held(claims([&steady, &late, &shaky, &late])), [false; 5]);
-        assert!(claims([&[], &[], &[], &[]]).iter().all(|claim| claim.held.is_empty()));
+        let nothing = claims([&[], &[], &[], &[]]);
+        assert!(nothing.iter().all(|claim| claim.held().is_empty()));
+        assert!(
+            nothing[0].ours.contains("after episode 1,000: —;"),
+            "{}",
+            nothing[0].ours
+        );
+        assert!(nothing[2].ours.starts_with("— times"), "{}", nothing[2].ours);
+        let short = of(&history(&[(60, 20.0)]));
+        assert!(
+            claims([&short, &short, &short, &short])[0]
+                .ours
+                .contains("after episode 1,000: —;"),
+            "a training that is too short has no mean after episode 1,000"
+        );
     }
 }

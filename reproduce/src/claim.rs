@@ -13,21 +13,19 @@ pub(super) struct Claim {
     pub(super) criterion: &'static str,
     /// What was measured.
     pub(super) ours: String,
-    pub(super) scope: Scope,
-    /// Whether the claim holds: one value for each seed that could be checked, or one for all seeds together.
-    pub(super) held: Vec<bool>,
-}
-
-/// What a claim is checked on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Scope {
-    /// Each seed separately. The claim holds if it holds for more than half of them.
-    EachSeed,
-    /// All seeds together, by a mean, a median or a count.
-    Together,
+    check: Check,
 }
 
 /// Whether a claim holds.
+#[derive(Clone, Debug)]
+enum Check {
+    /// For each seed that could be checked. The claim holds if it holds for more than half of them.
+    EachSeed(Vec<bool>),
+    /// For all seeds together, by a mean, a median or a count; `None` if results are missing.
+    Together(Option<bool>),
+}
+
+/// What the report says of a claim.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// It was a quick look, or results are missing.
@@ -47,15 +45,58 @@ pub(super) enum Verdict {
 }
 
 impl Claim {
+    /// A claim that is checked for each seed separately. `held` has a value for each seed that could be checked.
+    pub(super) fn each_seed(
+        thesis: &'static str,
+        criterion: &'static str,
+        ours: String,
+        held: impl IntoIterator<Item = bool>,
+    ) -> Self {
+        Self {
+            thesis,
+            criterion,
+            ours,
+            check: Check::EachSeed(held.into_iter().collect()),
+        }
+    }
+
+    /// A claim that is checked for all seeds together; `held` is `None` if results are missing.
+    pub(super) fn together(thesis: &'static str, criterion: &'static str, ours: String, held: Option<bool>) -> Self {
+        Self {
+            thesis,
+            criterion,
+            ours,
+            check: Check::Together(held),
+        }
+    }
+
     pub(super) fn verdict(&self, effort: Effort) -> Verdict {
-        let (of, held) = (self.held.len(), self.held.iter().filter(|held| **held).count());
-        match effort {
-            Effort::Quick => Verdict::NotChecked,
-            Effort::Full if of == 0 => Verdict::NotChecked,
-            Effort::Full if self.scope == Scope::Together && held == of => Verdict::HoldsTogether,
-            Effort::Full if self.scope == Scope::Together => Verdict::FailsTogether,
-            Effort::Full if 2 * held > of => Verdict::Holds { of, held },
-            Effort::Full => Verdict::Fails { of, held },
+        if effort == Effort::Quick {
+            return Verdict::NotChecked;
+        }
+        match &self.check {
+            Check::Together(None) => Verdict::NotChecked,
+            Check::Together(Some(true)) => Verdict::HoldsTogether,
+            Check::Together(Some(false)) => Verdict::FailsTogether,
+            Check::EachSeed(seeds) => {
+                let (of, held) = (seeds.len(), seeds.iter().filter(|held| **held).count());
+                if of == 0 {
+                    Verdict::NotChecked
+                } else if 2 * held > of {
+                    Verdict::Holds { of, held }
+                } else {
+                    Verdict::Fails { of, held }
+                }
+            }
+        }
+    }
+
+    /// Whether the claim holds: for each seed that could be checked, or once for all seeds together.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> Vec<bool> {
+        match &self.check {
+            Check::EachSeed(held) => held.clone(),
+            Check::Together(held) => held.iter().copied().collect(),
         }
     }
 }
@@ -101,7 +142,8 @@ pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> 
     )
 }
 
-/// The median of sorted values. There must be at least one.
+/// The median of sorted values. There must be at least one. Unlike `shoal_report::figure::quantile`, this computes no
+/// difference, which would be NaN for two infinite values.
 pub(super) fn median(sorted: &[f64]) -> f64 {
     let middle = sorted.len() / 2;
     if sorted.len() % 2 == 1 {
@@ -121,13 +163,7 @@ mod tests {
     use super::*;
 
     fn claim(held: &[bool]) -> Claim {
-        Claim {
-            thesis: "it works",
-            criterion: "it does",
-            ours: String::new(),
-            scope: Scope::EachSeed,
-            held: held.into(),
-        }
+        Claim::each_seed("it works", "it does", String::new(), held.iter().copied())
     }
 
     #[test]
@@ -136,10 +172,7 @@ mod tests {
         assert_eq!(verdict(&[true, true, false]), Verdict::Holds { of: 3, held: 2 });
         assert_eq!(verdict(&[true, false]), Verdict::Fails { of: 2, held: 1 });
         assert_eq!(verdict(&[]), Verdict::NotChecked);
-        let together = |held| Claim {
-            scope: Scope::Together,
-            ..claim(&[held])
-        };
+        let together = |held| Claim::together("it works", "it does", String::new(), Some(held));
         assert_eq!(together(true).verdict(Effort::Full).to_string(), "**holds**");
         assert_eq!(together(false).verdict(Effort::Full), Verdict::FailsTogether);
         assert_eq!(together(true).verdict(Effort::Quick), Verdict::NotChecked);

@@ -47,6 +47,25 @@ pub(super) struct Policies {
 }
 
 impl Policies {
+    /// Opens a trained run, which must have these settings. An interrupted final evaluation is completed.
+    fn open(folder: &Folder, experiment: &Experiment, seed: u64, settings: &RunSettings) -> anyhow::Result<Self> {
+        let run = RunDir::open(&folder.run(experiment, seed))?;
+        let config = run.config()?;
+        // The result's header states the settings of the run itself, so they must be the expected ones.
+        RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
+        let steps = saved_status(&config, &run)?.env_steps;
+        if FinalEvaluation::read(&run, steps)?.is_none() {
+            // It was interrupted.
+            evaluate_and_keep_best(&config, &run.lock()?, steps, &Interrupt::default(), |_, _| ())?;
+        }
+        Ok(Self {
+            best: SavedPolicy::Best.read(&run, &config)?,
+            last: SavedPolicy::Last.read(&run, &config)?,
+            config,
+            run,
+        })
+    }
+
     /// The training's episodes in order. This requires a run with one actor, one environment and at most one episode
     /// per chunk, so that every episode has its own policy version. If a run is interrupted before the learner uses a
     /// chunk, its episode is collected and recorded again; such duplicates are removed, and so are episodes beyond the
@@ -61,8 +80,8 @@ impl Policies {
         let (recorded, ended) = (episodes.len() as u64, saved_status(&self.config, &self.run)?.episodes);
         ensure!(
             recorded >= ended.min(self.config.run.episodes.unwrap_or(u64::MAX)),
-            "{}: episodes.csv has {recorded} of {ended} episodes, because a launcher was killed: remove this directory, and \
-             repeat the command",
+            "{}: episodes.csv has {recorded} of {ended} episodes, because a launcher was killed: remove this \
+             directory, and repeat the command",
             self.run.path().display()
         );
         Ok(episodes)
@@ -120,22 +139,7 @@ fn store_result<F: Family>(
     length: Length,
     settings: &RunSettings,
 ) -> anyhow::Result<()> {
-    let run = RunDir::open(&folder.run(experiment, seed))?;
-    let config = run.config()?;
-    // The result's header states the settings of the run itself, so they must be the expected ones.
-    RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
-    let steps = saved_status(&config, &run)?.env_steps;
-    if FinalEvaluation::read(&run, steps)?.is_none() {
-        // It was interrupted.
-        evaluate_and_keep_best(&config, &run.lock()?, steps, &Interrupt::default(), |_, _| ())?;
-    }
-    let policies = Policies {
-        best: SavedPolicy::Best.read(&run, &config)?,
-        last: SavedPolicy::Last.read(&run, &config)?,
-        config,
-        run,
-    };
-    let run = &policies.run;
+    let policies = Policies::open(folder, experiment, seed, settings)?;
     let evaluate = |policy: &PolicyFile| -> anyhow::Result<Policy> {
         let config = &policies.config;
         let episodes = config.evaluation.final_episodes;
@@ -144,7 +148,7 @@ fn store_result<F: Family>(
             evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
         })
     };
-    let mut evaluations: Vec<Evaluation> = read_evaluations(&run.evaluations())?
+    let mut evaluations: Vec<Evaluation> = read_evaluations(&policies.run.evaluations())?
         .into_iter()
         .map(|row| Evaluation {
             steps: row.env_steps,
@@ -158,7 +162,7 @@ fn store_result<F: Family>(
         evaluations,
         best: evaluate(&policies.best)?,
         last: evaluate(&policies.last)?,
-        tests: F::measure(&policies, stage)?,
+        measurements: F::measure(&policies, stage)?,
     };
     folder.add(experiment, stage, &result)
 }

@@ -6,7 +6,7 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
-use shoal_report::figure::{self, CurvesOfSetting, Frame};
+use shoal_report::figure::{self, CurvesOfSetting, DiagramAxes};
 use shoal_run::evaluation::analysis::lake::{ExpectedResult, LIMIT, greedy, optimal};
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::recorder::read_evaluations;
@@ -25,22 +25,22 @@ const EPISODES: u64 = 10_000;
 /// Number of episodes between points of a curve.
 const GRID: u64 = 100;
 
-const GOOD: &str = "frozen-lake";
+const CHOSEN: &str = "frozen-lake";
 const EPSILON: [(&str, &str); 3] = [
     ("frozen-lake-epsilon-0.1", "ε = 0.1"),
-    (GOOD, "ε = 0.4"),
+    (CHOSEN, "ε = 0.4"),
     ("frozen-lake-epsilon-0.7", "ε = 0.7"),
 ];
 const ALPHA: [(&str, &str); 4] = [
     ("frozen-lake-alpha-0.01", "α = 0.01"),
-    (GOOD, "α = 0.03"),
+    (CHOSEN, "α = 0.03"),
     ("frozen-lake-alpha-0.1", "α = 0.1"),
     ("frozen-lake-alpha-0.3", "α = 0.3"),
 ];
 const SARSA: &str = "frozen-lake-sarsa";
 
 pub(super) const EXPERIMENTS: [Experiment; 7] = [
-    with_30_seeds(experiment(GOOD, "frozen-lake", &["evaluation.keep_policies=true"])),
+    with_30_seeds(experiment(CHOSEN, "frozen-lake", &["evaluation.keep_policies=true"])),
     with_30_seeds(experiment(
         EPSILON[0].0,
         "frozen-lake",
@@ -85,7 +85,7 @@ const fn experiment(name: &'static str, preset: &'static str, settings: &'static
     }
 }
 
-/// Sets three times the thesis's ten repetitions: ten do not show which of two exploration rates is better.
+/// Runs 30 seeds instead of the thesis's ten, which do not show which of two exploration rates is better.
 const fn with_30_seeds(experiment: Experiment) -> Experiment {
     Experiment {
         seeds: 30,
@@ -173,7 +173,7 @@ impl Family for FrozenLake {
     }
 
     fn sections(results: &Results<Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
-        let good = results.of(GOOD, "");
+        let chosen = results.of(CHOSEN, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
         let best_result = ExpectedResult::of(&greedy(&best));
@@ -186,14 +186,14 @@ impl Family for FrozenLake {
         ] {
             figures.extend(of_sweep(writer, file, sweep, what, number, best_result)?);
         }
-        if let Some(middle) = representative(good) {
+        if let Some(middle) = representative(chosen) {
             figures.push(writer.add(
                 "frozen-lake-policy",
                 format!(
                     "The greedy policy and its action-values after 10,000 episodes, seed {} (figure 4.4)",
                     middle.header.seed
                 ),
-                |path| draw_table(&middle.tests.q, path),
+                |path| draw_table(&middle.measurements.q, path),
             )?);
         }
         figures.push(writer.add(
@@ -245,7 +245,7 @@ fn of_sweep(
 ) -> anyhow::Result<Vec<Figure>> {
     let settings = |of: fn(&PolicySnapshot) -> f64| -> Vec<CurvesOfSetting> {
         let curves = sweep.iter().map(|(label, seeds)| {
-            let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
+            let runs: Vec<_> = seeds.iter().map(|seed| seed.measurements.on_grid(of)).collect();
             CurvesOfSetting {
                 label: (*label).into(),
                 curve: figure::pointwise(&runs, mean),
@@ -254,18 +254,18 @@ fn of_sweep(
         });
         curves.collect()
     };
-    let frame = |title, y, level| Frame {
+    let axes = |title, y, level| DiagramAxes {
         title,
         x: ("training episode", EPISODES as f64),
         y,
         level: Some(("best policy", level)),
     };
-    let rewards = frame(
+    let rewards = axes(
         "Reward of the greedy policy",
         ("probability of the goal", 0.0, 1.0),
         best.reached,
     );
-    let steps = frame(
+    let steps = axes(
         "Steps of the greedy policy",
         ("steps to the goal (at most 100)", 0.0, 105.0),
         best.steps,

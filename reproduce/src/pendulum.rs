@@ -5,7 +5,7 @@ use shoal_report::figure;
 use shoal_run::evaluation::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::evaluation::rollout::Rollout;
 
-use super::claim::{Claim, Scope, spread};
+use super::claim::{Claim, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::report_section::{FigureWriter, ReportSection};
@@ -77,7 +77,7 @@ impl Family for Pendulum {
                     "The swing-up from rest at θ = π, seed {} (figure 4.9)",
                     middle.header.seed
                 ),
-                |path| figure::swing_up(&middle.tests.swing_up, path),
+                |path| figure::swing_up(&middle.measurements.swing_up, path),
             )?);
         }
         Ok(vec![ReportSection {
@@ -94,42 +94,34 @@ fn claims(seeds: &[SeedResult<Measurements>]) -> Vec<Claim> {
     let around_150 = |value: f64| (-190.0..=-110.0).contains(&value);
     let measured = |of: fn(&Measures) -> f64, decimals, unit| {
         let [best, last] = [0, 1].map(|i| {
-            let measures = |seed: &SeedResult<Measurements>| of([&seed.tests.best, &seed.tests.last][i]);
+            let measures = |seed: &SeedResult<Measurements>| of([&seed.measurements.best, &seed.measurements.last][i]);
             spread(seeds.iter().map(measures), decimals)
         });
         format!("{best}{unit} (last policy {last}{unit})")
     };
-    let check = |thesis, criterion, ours, holds: fn(&Measures) -> bool| Claim {
-        thesis,
-        criterion,
-        ours,
-        scope: Scope::EachSeed,
-        held: seeds.iter().map(|seed| holds(&seed.tests.best)).collect(),
-    };
+    let of_best = |holds: fn(&Measures) -> bool| seeds.iter().map(move |seed| holds(&seed.measurements.best));
     vec![
-        Claim {
-            thesis: "The agent improves until converging to a mean reward of approximately −150",
-            criterion: "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the \
-                        evaluations during training lie between −190 and −110",
-            ours: format!(
+        Claim::each_seed(
+            "The agent improves until converging to a mean reward of approximately −150",
+            "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the evaluations during \
+             training lie between −190 and −110",
+            format!(
                 "final evaluation {} (last policy {}); last fifth of the evaluations {}",
                 spread(seeds.iter().map(|seed| seed.best.evaluation.return_mean), 1),
                 spread(seeds.iter().map(|seed| seed.last.evaluation.return_mean), 1),
                 spread(seeds.iter().map(SeedResult::late_mean), 1)
             ),
-            scope: Scope::EachSeed,
-            held: seeds
+            seeds
                 .iter()
-                .map(|seed| around_150(seed.best.evaluation.return_mean) && around_150(seed.late_mean()))
-                .collect(),
-        },
-        check(
+                .map(|seed| around_150(seed.best.evaluation.return_mean) && around_150(seed.late_mean())),
+        ),
+        Claim::each_seed(
             "The pendulum swings back and forth a few times to gain momentum",
             "it turns back at least once before it is upright",
             format!("turns: {}", measured(|it| it.reversals.into(), 0, "")),
-            |it| it.reversals >= 1,
+            of_best(|it| it.reversals >= 1),
         ),
-        check(
+        Claim::each_seed(
             "The angle and angular velocity converge to zero",
             "at rest the angle stays below 0.1 rad, the angular velocity below 0.1 rad/s",
             format!(
@@ -137,9 +129,9 @@ fn claims(seeds: &[SeedResult<Measurements>]) -> Vec<Claim> {
                 measured(|it| it.angle_at_rest, 3, " rad"),
                 measured(|it| it.velocity_at_rest, 3, " rad/s")
             ),
-            |it| it.angle_at_rest < 0.1 && it.velocity_at_rest < 0.1,
+            of_best(|it| it.angle_at_rest < 0.1 && it.velocity_at_rest < 0.1),
         ),
-        check(
+        Claim::each_seed(
             "The applied torque converges to a small value",
             "at rest the mean absolute torque is below 0.2 N m (its range is ±2)",
             format!(
@@ -147,7 +139,7 @@ fn claims(seeds: &[SeedResult<Measurements>]) -> Vec<Claim> {
                 measured(|it| it.torque_at_rest, 3, " N m"),
                 measured(|it| it.chatter_at_rest, 3, " N m")
             ),
-            |it| it.torque_at_rest < 0.2,
+            of_best(|it| it.torque_at_rest < 0.2),
         ),
     ]
 }
@@ -160,21 +152,21 @@ mod tests {
 
     fn seed(number: u64, return_mean: f64, swing_up: SwingUp) -> SeedResult<Measurements> {
         let measures = swing_up.measures();
-        let tests = Measurements {
+        let measurements = Measurements {
             best: measures.clone(),
             last: measures,
             swing_up: swing_up.rounded(),
         };
-        result(&EXPERIMENTS[0], number, return_mean, tests)
+        result(&EXPERIMENTS[0], number, return_mean, measurements)
     }
 
     #[test]
     fn claims_hold_for_results_like_the_thesis_and_fail_for_the_opposite() {
         let good = seed(1, -150.0, swing(0.01, 0.05));
         let bad = seed(2, -900.0, swing(0.5, 1.0));
-        let held: Vec<_> = claims(&[good, bad]).into_iter().map(|claim| claim.held).collect();
+        let held: Vec<_> = claims(&[good, bad]).into_iter().map(|claim| claim.held()).collect();
         assert_eq!(held, [[true, false], [true, true], [true, false], [true, false]]);
-        assert!(claims(&[]).iter().all(|claim| claim.held.is_empty()));
+        assert!(claims(&[]).iter().all(|claim| claim.held().is_empty()));
     }
 
     #[test]

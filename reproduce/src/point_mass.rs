@@ -161,13 +161,13 @@ mod tests {
             .map(|start| test_run(*start, rest, shake, force, held))
             .collect();
         let measures: Vec<_> = test_runs.iter().map(TestRun::measures).collect();
-        let tests = Measurements {
+        let measurements = Measurements {
             best: measures.clone(),
             last: measures,
             last_test_runs: test_runs[..4].iter().cloned().map(TestRun::rounded).collect(),
             test_runs: test_runs.into_iter().map(TestRun::rounded).collect(),
         };
-        result(&EXPERIMENTS[1], number, 100.0, tests)
+        result(&EXPERIMENTS[1], number, 100.0, measurements)
     }
 
     #[test]
@@ -195,7 +195,7 @@ mod tests {
 
     #[test]
     fn a_result_is_small_and_keeps_the_names_of_its_fields() {
-        let text = serde_json::to_string(&seed(1, 0.0123, 0.1234, 1.234, 0.1234).tests).unwrap();
+        let text = serde_json::to_string(&seed(1, 0.0123, 0.1234, 1.234, 0.1234).measurements).unwrap();
         let fields = ["\"best\":", "\"last\":", "\"drives\":", "\"last_drives\":"];
         assert!(fields.iter().all(|field| text.contains(field)));
         assert!(text.len() < 130_000, "{}", text.len());

@@ -1,4 +1,4 @@
-//! Shows the progress of a batch: one live line on a terminal, and one line for each event.
+//! Shows the progress of a reproduction: one live line on a terminal, and one line for each event.
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -21,20 +21,20 @@ pub(super) struct ProgressDisplay<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
-    /// Number of all jobs, including jobs that had finished before the batch began.
+    /// Number of all jobs, including jobs that had finished before this command began.
     total: usize,
-    /// Every job that had not finished when the batch began.
+    /// Every job that had not finished when this command began.
     due: BTreeMap<JobName, Due>,
     running: BTreeMap<JobName, PathBuf>,
     ended: Vec<JobName>,
     started_at: Instant,
 }
 
-/// A job that had not finished when the batch began. For the estimate of the remaining time, an episode counts as much
-/// as an environment step.
+/// A job that had not finished when this command began. For the estimate of the remaining time, an episode counts as
+/// much as an environment step.
 struct Due {
     length: Length,
-    /// Environment steps or episodes when the batch began.
+    /// Environment steps or episodes when this command began.
     begin: u64,
 }
 
@@ -153,7 +153,7 @@ impl<'a> ProgressDisplay<'a> {
         format!("{} of {} seeds", self.completed(), self.total)
     }
 
-    /// The time that the remaining work takes at the rate of this batch so far.
+    /// The time that the remaining work takes at this command's rate so far.
     fn time_left(&self) -> Option<Duration> {
         let (mut done, mut remaining) = (0, 0);
         for (name, due) in &self.due {

@@ -230,7 +230,6 @@ fn relative(path: &Path, from: &Path) -> PathBuf {
 
 #[cfg(test)]
 mod tests {
-    use super::super::claim::Scope;
     use super::*;
     use shoal_report::figure;
 
@@ -248,13 +247,12 @@ mod tests {
             title: "Pendulum",
             from: vec![("pendulum", "")],
             remark: "Upright is 0.".into(),
-            claims: vec![Claim {
-                thesis: "it swings up",
-                criterion: "it is up",
-                ours: "0.01".into(),
-                scope: Scope::EachSeed,
-                held: held.into(),
-            }],
+            claims: vec![Claim::each_seed(
+                "it swings up",
+                "it is up",
+                "0.01".into(),
+                held.iter().copied(),
+            )],
             figures: vec![Figure {
                 file: "swing".into(),
                 caption: "Figure 4.9".into(),

@@ -37,7 +37,8 @@ pub(super) struct SeedResult<T> {
     pub(super) best: Policy,
     /// The policy at the end.
     pub(super) last: Policy,
-    pub(super) tests: T,
+    #[serde(rename = "tests")]
+    pub(super) measurements: T,
 }
 
 /// An evaluation during training.
@@ -100,8 +101,8 @@ impl Header {
         let Versioned { schema } = parse(line)?;
         if schema != FORMAT {
             bail!(
-                "{} has schema {schema}, this program writes {FORMAT}: move it away, or choose another directory with \
-                 --out",
+                "{} has schema {schema}; this program reads schema {FORMAT}: move the file away, or choose another \
+                 directory with --out",
                 line.place
             );
         }
@@ -124,7 +125,8 @@ impl Header {
         if found != expected {
             let describe = |(name, seed, length): (&str, u64, Length)| format!("{name}, seed {seed}, {length}");
             bail!(
-                "{place} is the result of {}, not of {}: move it away, or choose another directory with --out",
+                "{place} is the result of {}, not of {}: move the file or directory away, or choose another directory \
+                 with --out",
                 describe(found),
                 describe(expected)
             );
@@ -141,7 +143,7 @@ pub(super) fn read<T: DeserializeOwned>(line: &ResultLine) -> anyhow::Result<See
 fn parse<T: DeserializeOwned>(line: &ResultLine) -> anyhow::Result<T> {
     serde_json::from_str(&line.text).with_context(|| {
         format!(
-            "{} is not a result of this program: move it away, and the result will be made again",
+            "{} is not a result of this program: move the file away, and its results will be made again",
             line.place
         )
     })
@@ -164,7 +166,7 @@ pub(super) mod tests {
     use super::*;
 
     /// A result of this seed. The best policy has this return, and the last policy a slightly lower one.
-    pub(crate) fn result<T>(experiment: &Experiment, seed: u64, return_mean: f64, tests: T) -> SeedResult<T> {
+    pub(crate) fn result<T>(experiment: &Experiment, seed: u64, return_mean: f64, measurements: T) -> SeedResult<T> {
         let policy = |return_mean| Policy {
             steps: 1_000,
             evaluation: EvaluationSummary {
@@ -192,7 +194,7 @@ pub(super) mod tests {
             evaluations: (0..=20).map(evaluation).collect(),
             best: policy(return_mean),
             last: policy(return_mean - 1.0),
-            tests,
+            measurements,
         }
     }
 
@@ -241,7 +243,7 @@ pub(super) mod tests {
         ] {
             let error = format!("{:#}", Header::read(&line(text)).unwrap_err());
             assert!(
-                error.contains(part) && error.contains("move it away") && !error.contains('\n'),
+                error.contains(part) && error.contains("move the file away") && !error.contains('\n'),
                 "{error}"
             );
         }

@@ -1,5 +1,5 @@
-//! The results of an experiment: one file, `<experiment>.jsonl.gz`. Its first line is the [`Head`]; every other line is
-//! the result of one seed and stage, ordered by seed and stage.
+//! The results of an experiment: one file, `<experiment>.jsonl.gz`. Its first line is the [`FirstLine`]; every other
+//! line is the result of one seed and stage, ordered by seed and stage.
 //!
 //! Earlier versions stored each result in its own file, `<experiment>/seed-N<stage>.json`. Such files are still read,
 //! and [`ResultsFile::move_old_results`] moves them into the new file.
@@ -24,7 +24,7 @@ const FORMAT: u32 = 2;
 
 /// The first line of the file.
 #[derive(Debug, Serialize, Deserialize)]
-struct Head {
+struct FirstLine {
     format: u32,
     experiment: String,
 }
@@ -65,7 +65,7 @@ pub(super) struct ResultsFile {
     path: PathBuf,
     /// The directory of the runs and of results in the old format.
     directory: PathBuf,
-    head: Head,
+    first_line: FirstLine,
     lines: BTreeMap<Key, ResultLine>,
 }
 
@@ -75,7 +75,7 @@ impl ResultsFile {
         let mut results = Self {
             path: folder.join(format!("{}.jsonl.gz", experiment.name)),
             directory: folder.join(experiment.name),
-            head: Head {
+            first_line: FirstLine {
                 format: FORMAT,
                 experiment: experiment.name.into(),
             },
@@ -109,16 +109,16 @@ impl ResultsFile {
         struct Versioned {
             format: u32,
         }
-        let head = lines.next().unwrap_or_default();
-        let Versioned { format } = serde_json::from_str(head).with_context(damaged)?;
+        let first_line = lines.next().unwrap_or_default();
+        let Versioned { format } = serde_json::from_str(first_line).with_context(damaged)?;
         if format != FORMAT {
             bail!(
                 "{here} has format {format}; this program reads format {FORMAT}: choose another directory with --out"
             );
         }
-        let head: Head = serde_json::from_str(head).with_context(damaged)?;
-        if head.experiment != self.head.experiment {
-            bail!("{here} contains the results of {}: {hint}", head.experiment);
+        let first_line: FirstLine = serde_json::from_str(first_line).with_context(damaged)?;
+        if first_line.experiment != self.first_line.experiment {
+            bail!("{here} contains the results of {}: {hint}", first_line.experiment);
         }
         for text in lines {
             let key: Key = serde_json::from_str(text).with_context(damaged)?;
@@ -211,11 +211,11 @@ impl ResultsFile {
 
     /// Writes the file, completely or not at all. Its bytes depend only on the results.
     fn write(&self) -> anyhow::Result<()> {
-        let head = serde_json::to_string(&self.head)?;
+        let first_line = serde_json::to_string(&self.first_line)?;
         write_atomically(&self.path, |file| -> io::Result<()> {
             // The gzip header has no file name and no time.
             let mut gzip = GzEncoder::new(file, Compression::best());
-            writeln!(gzip, "{head}")?;
+            writeln!(gzip, "{first_line}")?;
             for line in self.lines.values() {
                 writeln!(gzip, "{}", line.text)?;
             }

@@ -66,8 +66,8 @@ impl RunSettings {
         for (key, found) in &self.0 {
             if let Some(wanted) = expected.0.get(key).filter(|wanted| *wanted != found) {
                 bail!(
-                    "{made} was made with {key} = {found}, which is now {wanted}: move it away, or choose another \
-                     directory with --out"
+                    "{made} was made with {key} = {found}, which is now {wanted}: move the file or directory away, or \
+                     choose another directory with --out"
                 );
             }
         }

@@ -1,5 +1,6 @@
-//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each algorithm gives the bits
-//! of its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
+//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. In lockstep, each algorithm
+//! gives the same bits as its single-process twin, even if roles are killed. A run ends after a given number of
+//! episodes.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -109,7 +110,7 @@ fn free_q_learning_learns_from_each_row_once_also_with_a_small_ring() {
     let log = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
     assert!(!log.contains("were overwritten"), "{log}");
 
-    // Actors with full windows, whose rows are more than the ring has places.
+    // Together, the actors' full windows hold more rows than the ring.
     let set = ["run.mode=free", "replay.capacity=300", "replay.tolerance=20000"];
     let set = [
         set.map(|key| ["--set", key]).concat(),

@@ -94,7 +94,7 @@ fn survives_or_names(plan: &str) -> Result<(), TestCaseError> {
     Ok(())
 }
 
-pub(crate) fn arbitrary_answers_are_survived_or_named_in_one_line() {
+pub(crate) fn random_wrong_answers_are_survived_or_one_line_names_the_culprit() {
     // Always the same plans, unless PROPTEST_CASES asks for more.
     let wanted = std::env::var("PROPTEST_CASES")
         .ok()

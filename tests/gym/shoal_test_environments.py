@@ -128,7 +128,7 @@ class Offset(gym.Env):
 
 
 class Invalid(gym.Env):
-    """Returns something invalid: once in the life of a run directory's neighbourhood, or always until it is mended."""
+    """Returns something invalid: once in this working directory, or always until there is a file ``mended``."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -206,8 +206,8 @@ class Grows(Ends):
 
 
 class Draws(Ends):
-    """Shows its step as the height of a red column in a picture of 60 by 40 pixels; with ``dies`` its server is killed once,
-    in the third step of a film or always."""
+    """Shows its step as the height of a red column in a picture of 60 by 40 pixels; with ``dies`` its server is killed
+    once, in the third step of a film or always."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
@@ -305,7 +305,7 @@ def hostile_server(how):
 
 
 def endless_server():
-    """An environment server that never tells the end of an episode."""
+    """An environment server that never reports the end of an episode."""
     from shoal_gym import environments
 
     step = environments.Environments.step

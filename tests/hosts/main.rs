@@ -98,7 +98,7 @@ impl Cable {
         cable
     }
 
-    /// One that delays every packet by `delay`, and loses this share of them.
+    /// A cable that delays every packet by `delay` and loses the share `loss` of them.
     fn slow(number: u32, delay: Duration, loss: f64) -> Self {
         let mut cable = Self::without_cable(number);
         let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hosts/slow_cable.py");
@@ -152,7 +152,7 @@ impl Cable {
         ]);
     }
 
-    /// Drops every packet without telling anybody, or no longer.
+    /// Drops every packet silently, or lets packets pass again.
     fn set_silent(&self, silent: bool) {
         for host in [LEARNER, OTHER] {
             let device = self.device(host);

@@ -21,8 +21,7 @@ const TIMEOUT: Duration = Duration::from_secs(120);
 /// The same for a command that may be a whole training run.
 const COMMAND_TIMEOUT: Duration = Duration::from_secs(600);
 
-/// Settings for a quick run: small networks, a short warm-up, a small replay, few evaluation
-/// episodes.
+/// Settings for a quick run: small networks, a short warm-up, a small replay, few evaluation episodes.
 pub(crate) const QUICK: [&str; 10] = [
     "--set",
     "ddpg.hidden=[24, 16]",

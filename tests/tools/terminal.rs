@@ -6,6 +6,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::OpenOptionsExt;
 use std::process::{Child, Command};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use rustix::fs::OFlags;
 use rustix::process::{Pid, Signal, kill_process};
@@ -250,12 +251,20 @@ fn top_ends_when_its_terminal_goes_away() {
     let (mut master, slave) = open();
     let mut top = on(&slave, &place, &["top", "run"]).spawn().unwrap();
     drop(slave);
-    let (mut seen, mut bytes) = (Vec::new(), [0; 4096]);
-    while !String::from_utf8_lossy(&seen).contains("learner") {
-        let count = master.read(&mut bytes).unwrap();
-        seen.extend(&bytes[..count]);
-    }
-    drop(master);
+    let (sender, receiver) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let (mut seen, mut bytes) = (Vec::new(), [0; 4096]);
+        while !String::from_utf8_lossy(&seen).contains("learner") {
+            let count = master.read(&mut bytes).unwrap();
+            seen.extend(&bytes[..count]);
+        }
+        let _ = sender.send(master);
+    });
+    drop(
+        receiver
+            .recv_timeout(Duration::from_secs(120))
+            .expect("top shows the learner"),
+    );
     until("top has ended", || top.try_wait().unwrap().is_some());
     running.wait_for_learning();
 }

@@ -90,7 +90,8 @@ impl ActorFigures {
         match crowded {
             None => format!("{}: one for each process", self.cores),
             Some(Count { actors, processes, .. }) => format!(
-                "{}: from {} on ({processes} processes), processes share cores and efficiency depends on the machine",
+                "{}: with {} or more ({processes} processes), processes share cores, so the efficiency depends on the \
+                 machine",
                 self.cores,
                 of_actors(*actors)
             ),

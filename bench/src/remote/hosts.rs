@@ -26,14 +26,12 @@ use tempfile::TempDir;
 
 use super::cable::{Cable, End};
 use crate::measurement::{TimeBudget, interrupted};
+use crate::progress::{STARTUP_TIMEOUT, wait_for_replay};
 use crate::rows::{ENVIRONMENTS, Rows};
 use crate::temporary_run::TemporaryRun;
 
 /// Number of different chunks that are sent in turn.
 const CHUNKS: usize = 64;
-
-/// How long processes may take to be ready.
-const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How often the requests of the gate are answered, at least.
 const ANSWER_INTERVAL: Duration = Duration::from_millis(20);
@@ -58,7 +56,7 @@ impl Network {
     fn endpoint(&self) -> anyhow::Result<Endpoint> {
         match self {
             Self::Loopback => Ok("tcp/127.0.0.1:0".parse::<Endpoint>()?.with_port(Duration::ZERO)?),
-            // Nobody else is there.
+            // The port is free, because the namespace is new.
             Self::Cable(cable) => Ok(format!("tls/{}:7447", cable.address(End::Learner)).parse()?),
         }
     }
@@ -97,7 +95,7 @@ struct Launcher<'a> {
     run: &'a RunDir,
     control: ControlPort,
     leases: Vec<HostLease>,
-    /// The last actor's: the learner receives from all actors up to the last that it has heard of.
+    /// Of the last actor, because the learner receives from all actors up to the last one that has sent a heartbeat.
     heartbeat: HeartbeatSender,
 }
 
@@ -201,7 +199,7 @@ impl<'a> RemoteRun<'a> {
         let mut chunks = vec![vec![0.0; ENVIRONMENTS * config.row_layout().width()]; CHUNKS];
         chunks.iter_mut().try_for_each(|chunk| rows.fill(chunk))?;
         let mut learner = ChildProcess::role(Role::Learner, run)?;
-        let replay = wait_for_file(&run.replay_file(), || {
+        let replay = wait_for_replay(&run.replay_file(), || {
             learner.check()?;
             budget.check()
         })?;
@@ -362,7 +360,7 @@ impl<'a> RemoteRun<'a> {
     pub(super) fn replace_gate(&mut self) -> anyhow::Result<()> {
         self.gate.signal(Signal::KILL)?;
         self.gate.wait(STARTUP_TIMEOUT);
-        // As the launcher does it.
+        // As the launcher does after a role has died.
         Domain::clean_up(self.temporary.config.run.id.as_str())?;
         self.gates += 1;
         self.gate = gate_process(self.network, self.temporary, self.gates)?;
@@ -414,7 +412,7 @@ impl JoinedHost {
         let mut command = run.network.command(End::Hosts, instance, directory.path())?;
         let mut relay = ChildProcess::start(&mut command, "relay".into()).context("cannot start the relay")?;
         let budget = run.budget;
-        let commits = wait_for_file(&directory.replay_file(), || {
+        let commits = wait_for_replay(&directory.replay_file(), || {
             relay.check()?;
             budget.check()
         })?;
@@ -504,19 +502,4 @@ fn gate_process(network: &Network, temporary: &TemporaryRun, incarnation: u64) -
     };
     let mut command = network.command(End::Learner, instance, temporary.run.path())?;
     ChildProcess::start(&mut command, "gate".into()).context("cannot start the gate")
-}
-
-/// Waits for a replay, or for a copy of its commit record.
-fn wait_for_file(path: &Path, mut check: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<CommitReader> {
-    let begun = Instant::now();
-    loop {
-        if let Some(reader) = CommitReader::open_if_ready(path)? {
-            return Ok(reader);
-        }
-        if begun.elapsed() >= STARTUP_TIMEOUT {
-            bail!("{} was not made within {} s", path.display(), STARTUP_TIMEOUT.as_secs());
-        }
-        check()?;
-        std::thread::sleep(Duration::from_millis(5));
-    }
 }

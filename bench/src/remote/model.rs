@@ -1,9 +1,9 @@
 //! A closed queueing network that predicts the rates of remote actors from the costs of the stages that a chunk passes.
 //!
 //! Each actor has a window of chunks in circulation: one is being filled, the others are under way or wait. A chunk
-//! passes its actor, its host's relay and link, the learner's link, the gate and the learner; then it takes a while until
-//! the actor knows that it is committed. All actors are alike. Times are assumed to be exponentially distributed, so
-//! real waits are shorter than predicted.
+//! passes its actor, its host's relay and link, the learner's link, the gate and the learner; then it takes a while
+//! until the actor knows that it is committed. All actors are alike. Times are assumed to be exponentially distributed,
+//! so real waits are shorter than predicted.
 //!
 //! The network is solved by the approximation of Schweitzer (1979): a chunk that arrives at a station finds the mean
 //! number of chunks there, less its own share of it. The time grows with the number of stations only.
@@ -90,7 +90,7 @@ impl Costs {
             }
             let before = rate;
             rate = window / (times.iter().sum::<f64>() + self.delay);
-            // Half a step: whole ones may swing.
+            // The mean of the old and the new value, because full steps may oscillate.
             for (present, time) in present.iter_mut().zip(times) {
                 *present = (*present + rate * time) / 2.0;
             }
@@ -139,7 +139,8 @@ pub(super) fn policy_age(bytes: f64, hosts: u32, published: f64, bandwidth: f64,
         .min(published);
     PolicyAge {
         policies_per_second: of_a_host,
-        // It is as old as its transfer when it comes, and older by a period when the next one comes.
+        // On arrival a policy is as old as its transfer took. It ages by one period until the next one arrives; this is
+        // the mean.
         mean_age_s: transfer + 0.5 / of_a_host,
     }
 }

@@ -60,7 +60,7 @@ pub(super) struct Recovery {
 }
 
 impl Startup {
-    pub(super) fn warmup(&self) -> Duration {
+    pub(super) fn warm_up(&self) -> Duration {
         self.warm - self.first_row
     }
 }

@@ -31,19 +31,11 @@ pub fn compare_paths(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
                 ..Series::line("", BLUE, run.path().collect())
             });
             let start_points = agent.test_runs.iter().map(|run| (run.start[0], run.start[1]));
+            let series = paths.chain([starts(start_points.collect()), goal()]).collect();
+            let (x, y) = (Axis::new("x (m)", range.clone()), Axis::new("y (m)", range.clone()));
             Panel {
-                title: &agent.name,
-                note: "",
-                x: Axis {
-                    label: "x (m)",
-                    range: range.clone(),
-                },
-                y: Axis {
-                    label: "y (m)",
-                    range: range.clone(),
-                },
-                series: paths.chain([starts(start_points.collect()), goal()]).collect(),
                 equal_scale: true,
+                ..Panel::new(&agent.name, x, y, series)
             }
             .draw(&cell)?;
         }

@@ -23,22 +23,10 @@ pub fn episode(signals: &[Signal], time_step: Option<f64>, trajectory: &Trajecto
     save(path, (WIDTH, HEIGHT * rows as u32), |sheet| {
         for (signal, row) in signals.iter().zip(sheet.split_evenly((rows, 1))) {
             let values = trajectory.values(signal.source);
-            let panel = Panel {
-                title: &signal.label,
-                note: "",
-                x: Axis { label, range: 0.0..end },
-                y: Axis {
-                    label: &signal.unit,
-                    range: range_of(values.iter().copied()),
-                },
-                series: vec![Series::line(
-                    "",
-                    BLUE,
-                    (0..).map(|t| f64::from(t) * unit).zip(values).collect(),
-                )],
-                equal_scale: false,
-            };
-            panel.draw(&row)?;
+            let y = Axis::new(&signal.unit, range_of(values.iter().copied()));
+            let points = (0..).map(|t| f64::from(t) * unit).zip(values).collect();
+            let series = vec![Series::line("", BLUE, points)];
+            Panel::new(&signal.label, Axis::new(label, 0.0..end), y, series).draw(&row)?;
         }
         Ok(())
     })

@@ -40,14 +40,8 @@ pub fn learning_curve(
         None => String::new(),
     };
     let smoothed_label = format!("moving average of {averaged_points} evaluations, centred");
-    let x = Axis {
-        label,
-        range: 0.0..last as f64 / unit,
-    };
-    let y = Axis {
-        label: "evaluation return",
-        range: range_of(raw.iter().map(|(_, y)| *y)),
-    };
+    let x = Axis::new(label, 0.0..last as f64 / unit);
+    let y = Axis::new("evaluation return", range_of(raw.iter().map(|(_, y)| *y)));
     let mut series = Vec::new();
     if raw.len() <= 100 {
         series.push(Series {
@@ -71,15 +65,7 @@ pub fn learning_curve(
     }
 
     save(path, SIZE, |sheet| {
-        Panel {
-            title: &title,
-            note: "",
-            x,
-            y,
-            series,
-            equal_scale: false,
-        }
-        .draw(sheet)?;
+        Panel::new(&title, x, y, series).draw(sheet)?;
         if empty {
             let middle = (px(f64::from(SIZE.0) / 2.0), px(f64::from(SIZE.1) / 2.0));
             sheet.draw_text("no evaluation yet", &text(15.0, HPos::Center), middle)?;

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::canvas::{BLUE, INK, save};
 use super::learning_curve::unit_of;
+use super::lines::pointwise;
 use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
@@ -24,7 +25,7 @@ pub fn learning_curves(
         points.map(|(steps, value)| (steps as f64 / unit, value)).collect()
     };
     let mut series = Vec::new();
-    let [lower, median, upper] = [0.25, 0.5, 0.75].map(|share| quantiles(curves, share));
+    let [lower, median, upper] = [0.25, 0.5, 0.75].map(|share| pointwise(curves, |sorted| quantile(sorted, share)));
     if curves.len() > 2 {
         let outline = &mut lower.iter().chain(upper.iter().rev()).copied();
         series.push(Series {
@@ -56,32 +57,9 @@ pub fn learning_curves(
             ..Series::line(label, INK, vec![(x, height.start), (x, height.end)])
         });
     }
-    let panel = Panel {
-        title,
-        note: "",
-        x: Axis {
-            label,
-            range: 0.0..last.max(1_000) as f64 / unit,
-        },
-        y: Axis {
-            label: "evaluation return",
-            range: height,
-        },
-        series,
-        equal_scale: false,
-    };
+    let x = Axis::new(label, 0.0..last.max(1_000) as f64 / unit);
+    let panel = Panel::new(title, x, Axis::new("evaluation return", height), series);
     save(path, SIZE, |sheet| panel.draw(sheet))
-}
-
-/// The quantile `share` of the curves' values at each evaluation that all curves have.
-fn quantiles(curves: &[Vec<(u64, f64)>], share: f64) -> Vec<(u64, f64)> {
-    let common = curves.iter().map(Vec::len).min().unwrap_or(0);
-    let at = |i: usize| {
-        let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
-        values.sort_by(f64::total_cmp);
-        (curves[0][i].0, quantile(&values, share))
-    };
-    (0..common).map(at).collect()
 }
 
 /// The quantile `share` (0 to 1) of sorted values, interpolated linearly. There must be at least one value.
@@ -103,7 +81,7 @@ mod tests {
             [1.0, 1.75, 3.0, 8.0]
         );
         let curves = [vec![(10, 3.0), (20, 5.0)], vec![(10, 1.0)], vec![(10, 2.0), (20, 6.0)]];
-        assert_eq!(quantiles(&curves, 0.5), [(10, 2.0)]);
+        assert_eq!(pointwise(&curves, |sorted| quantile(sorted, 0.5)), [(10, 2.0)]);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use super::panel::{Axis, Panel, Series};
 const COLORS: [RGBColor; 4] = [BLUE, VERMILION, GREEN, PURPLE];
 
 /// The title, axes and reference line shared by the diagrams of a figure.
-pub struct Frame<'a> {
+pub struct DiagramAxes<'a> {
     /// Above the diagram.
     pub title: &'a str,
     /// Label and maximum of the x axis, which starts at 0.
@@ -31,7 +31,7 @@ pub struct CurvesOfSetting {
     pub runs: Vec<Vec<(f64, f64)>>,
 }
 
-impl<'a> Frame<'a> {
+impl<'a> DiagramAxes<'a> {
     fn panel(&self, title: &'a str, series: Vec<Series<'a>>) -> Panel<'a> {
         let (x, most) = self.x;
         let (y, least, greatest) = self.y;
@@ -40,33 +40,21 @@ impl<'a> Frame<'a> {
             width: 1.0,
             ..Series::line(label, INK, vec![(0.0, height), (most, height)])
         });
-        Panel {
-            title,
-            note: "",
-            x: Axis {
-                label: x,
-                range: 0.0..most,
-            },
-            y: Axis {
-                label: y,
-                range: least..greatest,
-            },
-            series: level.into_iter().chain(series).collect(),
-            equal_scale: false,
-        }
+        let series = level.into_iter().chain(series).collect();
+        Panel::new(title, Axis::new(x, 0.0..most), Axis::new(y, least..greatest), series)
     }
 }
 
 /// Draws the summary curves of all settings in one diagram. There are four colours, which repeat.
-pub fn lines(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
+pub fn lines(axes: &DiagramAxes<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
     let series = settings.iter().zip(COLORS.iter().cycle());
     let series = series.map(|(setting, color)| Series::line(&setting.label, *color, setting.curve.clone()));
-    let panel = frame.panel(frame.title, series.collect());
+    let panel = axes.panel(axes.title, series.collect());
     save(path, (860, 470), |sheet| panel.draw(sheet))
 }
 
 /// Draws one diagram for each setting, two in a row: thin lines for its runs, a thick one for its summary curve.
-pub fn lines_by_setting(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
+pub fn lines_by_setting(axes: &DiagramAxes<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
     let rows = settings.len().div_ceil(2).max(1);
     save(path, (1160, 380 * rows as u32), |sheet| {
         for (setting, cell) in settings.iter().zip(sheet.split_evenly((rows, 2))) {
@@ -79,7 +67,7 @@ pub fn lines_by_setting(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &
                 width: 2.4,
                 ..Series::line("median", BLUE, setting.curve.clone())
             };
-            frame.panel(&setting.label, runs.chain([curve]).collect()).draw(&cell)?;
+            axes.panel(&setting.label, runs.chain([curve]).collect()).draw(&cell)?;
         }
         Ok(())
     })
@@ -87,7 +75,7 @@ pub fn lines_by_setting(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &
 
 /// Summarises curves with the same x values, up to the end of the shortest: `summary` gets their sorted values at each
 /// x.
-pub fn pointwise(curves: &[Vec<(f64, f64)>], summary: impl Fn(&[f64]) -> f64) -> Vec<(f64, f64)> {
+pub fn pointwise<X: Copy>(curves: &[Vec<(X, f64)>], summary: impl Fn(&[f64]) -> f64) -> Vec<(X, f64)> {
     let common = curves.iter().map(Vec::len).min().unwrap_or(0);
     let at = |i: usize| {
         let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
@@ -105,12 +93,12 @@ mod tests {
     fn curves_are_summarised_up_to_the_end_of_the_shortest() {
         let curves = [vec![(1.0, 4.0), (2.0, 5.0)], vec![(1.0, 2.0)]];
         assert_eq!(pointwise(&curves, |sorted| sorted[0]), [(1.0, 2.0)]);
-        assert_eq!(pointwise(&[], |_| 0.0), []);
+        assert_eq!(pointwise::<f64>(&[], |_| 0.0), []);
     }
 
     #[test]
     fn settings_and_the_reference_line_are_labelled() {
-        let frame = Frame {
+        let axes = DiagramAxes {
             title: "CartPole",
             x: ("episode", 5_000.0),
             y: ("return", 0.0, 210.0),
@@ -126,8 +114,8 @@ mod tests {
             .collect();
         let dir = tempfile::tempdir().unwrap();
         for (file, settings) in [("together.svg", &settings[..]), ("none.svg", &[])] {
-            lines(&frame, settings, &dir.path().join(file)).unwrap();
-            lines_by_setting(&frame, settings, &dir.path().join(format!("apart-{file}"))).unwrap();
+            lines(&axes, settings, &dir.path().join(file)).unwrap();
+            lines_by_setting(&axes, settings, &dir.path().join(format!("apart-{file}"))).unwrap();
         }
         for file in ["together.svg", "apart-together.svg"] {
             let svg = std::fs::read_to_string(dir.path().join(file)).unwrap();

@@ -25,6 +25,12 @@ pub(super) struct Axis<'a> {
     pub(super) range: Range<f64>,
 }
 
+impl<'a> Axis<'a> {
+    pub(super) fn new(label: &'a str, range: Range<f64>) -> Self {
+        Self { label, range }
+    }
+}
+
 /// How the points of a series are shown.
 #[derive(Clone, Copy)]
 pub(super) enum SeriesStyle {
@@ -74,7 +80,19 @@ pub(super) struct Panel<'a> {
     pub(super) equal_scale: bool,
 }
 
-impl Panel<'_> {
+impl<'a> Panel<'a> {
+    /// A diagram without a note. Each axis has a scale of its own.
+    pub(super) fn new(title: &'a str, x: Axis<'a>, y: Axis<'a>, series: Vec<Series<'a>>) -> Self {
+        Self {
+            title,
+            note: "",
+            x,
+            y,
+            series,
+            equal_scale: false,
+        }
+    }
+
     pub(super) fn draw(mut self, area: &Area<'_>) -> anyhow::Result<()> {
         let (header, body) = area.split_vertically(px(TITLE_ROW + LEGEND_ROW));
         header.draw_text(

@@ -22,22 +22,14 @@ pub fn swing_up(swing: &SwingUp, path: &Path) -> anyhow::Result<()> {
         ..
     } = swing;
     let end = torque.len().max(1) as f64 * DT;
-    let time = || Axis {
-        label: "time (s)",
-        range: 0.0..end,
-    };
+    let time = || Axis::new("time (s)", 0.0..end);
 
-    let action = Panel {
-        title: "Control action",
-        note: "",
-        x: time(),
-        y: Axis {
-            label: "torque (N m)",
-            range: -2.2..2.2,
-        },
-        series: vec![Series::line("", BLUE, over_time(torque))],
-        equal_scale: false,
-    };
+    let action = Panel::new(
+        "Control action",
+        time(),
+        Axis::new("torque (N m)", -2.2..2.2),
+        vec![Series::line("", BLUE, over_time(torque))],
+    );
     let extent = range_of(angle.iter().chain(velocity).copied().chain([-1.0, 1.0]));
     let mut series = vec![
         Series::line("angle", BLUE, over_time(angle)),
@@ -54,17 +46,12 @@ pub fn swing_up(swing: &SwingUp, path: &Path) -> anyhow::Result<()> {
             ..level
         });
     }
-    let motion = Panel {
-        title: "Angle and angular velocity",
-        note: "",
-        x: time(),
-        y: Axis {
-            label: "angle (rad), angular velocity (rad/s)",
-            range: extent,
-        },
+    let motion = Panel::new(
+        "Angle and angular velocity",
+        time(),
+        Axis::new("angle (rad), angular velocity (rad/s)", extent),
         series,
-        equal_scale: false,
-    };
+    );
     save(path, (1100, 420), |sheet| {
         let (left, right) = sheet.split_horizontally(sheet.dim_in_pixel().0 / 2);
         action.draw(&left)?;

@@ -52,30 +52,19 @@ pub fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
     let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
     let mean = runs.iter().map(TestRun::final_distance).sum::<f64>() / runs.len().max(1) as f64;
     let note = format!("mean at the end: {mean:.3} m");
+    let (x, y) = (Axis::new("x (m)", extent.clone()), Axis::new("y (m)", extent));
     let paths = Panel {
-        title: "Trajectories",
-        note: "",
-        x: Axis {
-            label: "x (m)",
-            range: extent.clone(),
-        },
-        y: Axis {
-            label: "y (m)",
-            range: extent,
-        },
-        series: lines,
         equal_scale: true,
+        ..Panel::new("Trajectories", x, y, lines)
     };
     let distances = Panel {
-        title: "Distance to goal",
         note: &note,
-        x: time_steps(runs.iter().map(|run| run.steps()).max()),
-        y: Axis {
-            label: "distance (m)",
-            range: 0.0..1.05 * farthest,
-        },
-        series: runs.iter().map(|run| thin(distances(run))).collect(),
-        equal_scale: false,
+        ..Panel::new(
+            "Distance to goal",
+            time_steps(runs.iter().map(|run| run.steps()).max()),
+            Axis::new("distance (m)", 0.0..1.05 * farthest),
+            runs.iter().map(|run| thin(distances(run))).collect(),
+        )
     };
     save(path, (1160, 560), |sheet| {
         let (left, right) = sheet.split_horizontally(sheet.dim_in_pixel().0 / 2);
@@ -87,38 +76,29 @@ pub fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
 pub(super) fn draw_path(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
     let [x, y] = run.start;
     let extent = extent(run.path());
+    let title = format!("From ({x}, {y})").replace('-', "\u{2212}");
+    let series = vec![
+        Series::line("", BLUE, run.path().collect()),
+        starts(vec![(x, y)]),
+        goal(),
+    ];
+    let (x, y) = (Axis::new("x (m)", extent.clone()), Axis::new("y (m)", extent));
     let panel = Panel {
-        title: &format!("From ({x}, {y})").replace('-', "\u{2212}"),
-        note: "",
-        x: Axis {
-            label: "x (m)",
-            range: extent.clone(),
-        },
-        y: Axis {
-            label: "y (m)",
-            range: extent,
-        },
-        series: vec![
-            Series::line("", BLUE, run.path().collect()),
-            starts(vec![(x, y)]),
-            goal(),
-        ],
         equal_scale: true,
+        ..Panel::new(&title, x, y, series)
     };
     panel.draw(area)
 }
 
 pub(super) fn draw_distance(title: &str, run: &TestRun, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
-        title,
         note: &format!("{:.3} m at the end", run.final_distance()),
-        x: time_steps(Some(run.steps())),
-        y: Axis {
-            label: "distance (m)",
-            range: 0.0..1.05 * farthest,
-        },
-        series: vec![Series::line("", BLUE, distances(run))],
-        equal_scale: false,
+        ..Panel::new(
+            title,
+            time_steps(Some(run.steps())),
+            Axis::new("distance (m)", 0.0..1.05 * farthest),
+            vec![Series::line("", BLUE, distances(run))],
+        )
     };
     panel.draw(area)
 }
@@ -126,37 +106,29 @@ pub(super) fn draw_distance(title: &str, run: &TestRun, farthest: f64, area: &Ar
 pub(super) fn draw_actions(title: &str, run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
     let direction = over_steps(run.direction.iter().map(|theta| theta / PI));
     let force = over_steps(run.force.iter().copied());
-    let panel = Panel {
-        title,
-        note: "",
-        x: time_steps(Some(run.steps())),
-        y: Axis {
-            label: "force (N), direction (half turns)",
-            range: -1.1..2.1,
+    let series = vec![
+        Series {
+            width: 1.4,
+            ..Series::line("force", BLUE, force)
         },
-        series: vec![
-            Series {
-                width: 1.4,
-                ..Series::line("force", BLUE, force)
-            },
-            Series {
-                width: 1.4,
-                ..Series::line("direction, scaled to [\u{2212}1, 1]", VERMILION, direction)
-            },
-        ],
-        equal_scale: false,
-    };
-    panel.draw(area)
+        Series {
+            width: 1.4,
+            ..Series::line("direction, scaled to [\u{2212}1, 1]", VERMILION, direction)
+        },
+    ];
+    let y = Axis::new("force (N), direction (half turns)", -1.1..2.1);
+    Panel::new(title, time_steps(Some(run.steps())), y, series).draw(area)
 }
 
 fn draw_rewards(run: &TestRun, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
-        title: "Rewards",
         note: &format!("return {:.1}", run.episode_return()).replace('-', "\u{2212}"),
-        x: time_steps(Some(run.steps())),
-        y: Axis { label: "reward", range },
-        series: vec![Series::line("", GREEN, over_steps(run.rewards.iter().copied()))],
-        equal_scale: false,
+        ..Panel::new(
+            "Rewards",
+            time_steps(Some(run.steps())),
+            Axis::new("reward", range),
+            vec![Series::line("", GREEN, over_steps(run.rewards.iter().copied()))],
+        )
     };
     panel.draw(area)
 }
@@ -181,10 +153,7 @@ pub(super) fn over_steps(values: impl Iterator<Item = f64>) -> Vec<(f64, f64)> {
 }
 
 pub(super) fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
-    Axis {
-        label: "time step",
-        range: 0.0..steps.unwrap_or(1).max(1) as f64,
-    }
+    Axis::new("time step", 0.0..steps.unwrap_or(1).max(1) as f64)
 }
 
 /// The x and y range of a square that is centred on the goal and contains all points.

@@ -13,6 +13,8 @@ use shoal_env_server::frame::Image;
 use shoal_run::signals::{self, Interrupt};
 use tempfile::TempDir;
 
+use super::FilmFailure;
+
 /// The program's name.
 const PROGRAM: &str = "ffmpeg";
 /// How long it may take for a picture, and to end after the last one.
@@ -27,9 +29,7 @@ pub(super) fn check() -> anyhow::Result<()> {
     if std::env::split_paths(&path).any(|directory| directory.join(PROGRAM).is_file()) {
         return Ok(());
     }
-    bail!(
-        "a film in .mp4 is written by the program {PROGRAM}, which is not in PATH: install it, or name a .gif with --out"
-    )
+    bail!("an .mp4 film needs the program {PROGRAM}, which is not in PATH: install it, or name a .gif file with --out")
 }
 
 /// A running `ffmpeg`. It is ended on drop.
@@ -37,14 +37,14 @@ pub(super) struct Ffmpeg {
     child: Child,
     /// Goes to the thread that writes to the program, so that a program that reads nothing does not block this thread.
     pictures: Option<SyncSender<Vec<u8>>>,
-    place: TempDir,
+    directory: TempDir,
 }
 
 impl Ffmpeg {
     /// Starts it for pictures of this size, `fps` of them in a second.
     pub(super) fn start((width, height): (usize, usize), fps: f64) -> anyhow::Result<Self> {
-        let place = tempfile::tempdir().context("cannot make a temporary directory")?;
-        let words = File::create(place.path().join("words")).context("cannot write a temporary file")?;
+        let directory = tempfile::tempdir().context("cannot make a temporary directory")?;
+        let stderr = File::create(directory.path().join("stderr")).context("cannot write a temporary file")?;
         let mut child = Command::new(PROGRAM)
             .args(["-nostdin", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"])
             .args(["-s", &format!("{width}x{height}"), "-framerate", &format!("{fps:.6}")])
@@ -58,11 +58,11 @@ impl Ffmpeg {
                 "yuv420p",
             ])
             .args(["-movflags", "+faststart", "-f", "mp4"])
-            .arg(place.path().join("film"))
+            .arg(directory.path().join("film"))
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            .stderr(words)
-            // Ctrl-C is for this program, which then ends that one.
+            .stderr(stderr)
+            // Ctrl-C reaches only this process, which then ends ffmpeg.
             .process_group(0)
             .spawn()
             .context("cannot start ffmpeg")?;
@@ -76,7 +76,11 @@ impl Ffmpeg {
             {}
         })?;
         let pictures = Some(pictures);
-        Ok(Self { child, pictures, place })
+        Ok(Self {
+            child,
+            pictures,
+            directory,
+        })
     }
 
     /// Adds a picture.
@@ -97,17 +101,17 @@ impl Ffmpeg {
     }
 
     /// Waits for the film and copies it.
-    pub(super) fn finish(mut self, to: &mut impl Write, interrupt: &Interrupt) -> anyhow::Result<()> {
+    pub(super) fn finish(mut self, to: &mut impl Write, interrupt: &Interrupt) -> Result<(), FilmFailure> {
         drop(self.pictures.take());
         let since = Instant::now();
         let status = loop {
-            if let Some(status) = self.child.try_wait()? {
+            if let Some(status) = self.child.try_wait().context("cannot wait for ffmpeg")? {
                 break status;
             }
             pause(since, interrupt)?;
         };
         if !status.success() {
-            return Err(self.failure());
+            return Err(self.failure().into());
         }
         let mut film = File::open(self.film()).context("ffmpeg wrote no film")?;
         std::io::copy(&mut film, to)?;
@@ -115,31 +119,35 @@ impl Ffmpeg {
     }
 
     fn film(&self) -> PathBuf {
-        self.place.path().join("film")
+        self.directory.path().join("film")
     }
 
-    /// The last line that it wrote.
+    /// Ends ffmpeg. Returns an error with the last line that it wrote.
     fn failure(&mut self) -> anyhow::Error {
         let _ = self.child.kill();
         let _ = self.child.wait();
-        let mut words = Vec::new();
-        let _ = File::open(self.place.path().join("words")).and_then(|file| file.take(1 << 16).read_to_end(&mut words));
-        let words = String::from_utf8_lossy(&words);
-        let last = words
+        let mut stderr = Vec::new();
+        let written = File::open(self.directory.path().join("stderr"));
+        let _ = written.and_then(|file| file.take(1 << 16).read_to_end(&mut stderr));
+        let stderr = String::from_utf8_lossy(&stderr);
+        let last = stderr
             .lines()
             .rfind(|line| !line.trim().is_empty())
-            .unwrap_or("it has ended");
+            .unwrap_or("it ended without a message");
         anyhow::anyhow!("ffmpeg failed: {}", last.trim())
     }
 }
 
-/// Waits for a moment, unless a signal has arrived or it has lasted too long.
+/// Sleeps briefly. Returns an error if a signal has arrived, or if [`TIMEOUT`] has passed since `since`.
 fn pause(since: Instant, interrupt: &Interrupt) -> anyhow::Result<()> {
     if let Some(signal) = interrupt.signal() {
         bail!("ended by {}", signals::describe(signal));
     }
     if since.elapsed() > TIMEOUT {
-        bail!("ffmpeg has not gone on for {} s", TIMEOUT.as_secs());
+        bail!(
+            "ffmpeg has made no progress for {} s: try again, or name a .gif file with --out",
+            TIMEOUT.as_secs()
+        );
     }
     std::thread::sleep(Duration::from_millis(5));
     Ok(())

@@ -88,13 +88,13 @@ impl Painter {
         let pixels = |length: f64| ((length * scale).round() as u32).max(1);
         let mut canvas = Pixmap::new(pixels(wide), pixels(high))?;
         canvas.fill(colour(PAPER));
-        // The view is in the middle if it was too long.
+        // A view that was too long is centred.
         let (left, top) = ((x0 + x1 - wide) / 2.0, (y0 + y1 + high) / 2.0);
         let place = |[x, y]: Point| [((x - left) * scale) as f32, ((top - y) * scale) as f32];
         let unit = canvas.width().min(canvas.height()) as f32;
         let mut trail = path(self.trail.iter().copied().map(place));
         for shape in &drawing.shapes {
-            // What moves lies above its path.
+            // The body is painted above its trail.
             if shape.class == Class::Body {
                 draw(&mut canvas, trail.take().as_ref(), &stroked(TRAIL, 0.009), unit);
             }

@@ -3,7 +3,7 @@ use shoal_env_server::environment::SignalSource;
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::testing::small;
 
-use super::animation::tests::decoded;
+use super::gif::tests::decoded;
 use super::*;
 
 fn directory(parent: &Path, config: &Config, parameters: &[f32]) -> RunDir {

@@ -7,9 +7,10 @@ const DESCRIBED = 8;
 const LONG_LEGEND = 12;
 
 /**
- * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`; optionally `marks`, `height`, `line` (a target
- * value), `smoothing` (the share of the axis over which a moving mean is drawn; 0 for none). A series has `name`, `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin,
- * fine, thick). A mark has `x`, `kind` and `text`.
+ * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`; optionally `marks`, `height`, `line` (a
+ * target value), `smoothing` (the share of the axis over which a moving mean is drawn; 0 for none). A series has `name`,
+ * `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin, fine, thick). A mark has
+ * `x`, `kind` and `text`.
  */
 class Chart {
   constructor(options) {
@@ -39,7 +40,7 @@ class Chart {
       this.picture,
       this.readout,
     );
-    // From the beginning, so that nothing moves when it is drawn.
+    // The height is reserved, so that nothing moves when the chart is drawn.
     this.plot.style.minHeight = `${this.height}px`;
     const button = (sign, name, onclick) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick }, sign);
     this.element = html(

@@ -66,6 +66,7 @@ const whole = (value) => (isNumber(value) ? value.toLocaleString("en-GB") : "–
 /** Seconds as a duration, such as "3 min 20 s". */
 function duration(seconds) {
   if (!isNumber(seconds)) return "–";
+  if (seconds >= 59.95) seconds = Math.round(seconds);
   if (seconds < 60) return `${Number(seconds.toFixed(seconds < 10 ? 2 : 1))} s`;
   const minutes = Math.floor(seconds / 60);
   if (minutes < 60) return `${minutes} min ${Math.round(seconds % 60)} s`;

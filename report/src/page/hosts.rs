@@ -27,7 +27,7 @@ pub(super) struct JoinedHost {
 }
 
 impl JoinedHost {
-    /// The hosts of these records, in the order of their joining.
+    /// The hosts of these records, in the order in which they joined.
     pub(super) fn all(records: &[HostRecord]) -> Vec<Self> {
         let mut hosts: Vec<Vec<&HostRecord>> = Vec::new();
         for record in records {
@@ -43,7 +43,9 @@ impl JoinedHost {
     fn of(rows: &[&HostRecord]) -> Self {
         let (first, last) = (rows[0], rows[rows.len() - 1]);
         let connected = || rows.iter().filter(|row| row.state == RecordedHostState::Connected);
-        let cut_offs = rows.iter().filter(|row| row.state == RecordedHostState::CutOff);
+        // A host whose state does not change is recorded every few seconds too.
+        let is_cut = |row: &HostRecord| row.state == RecordedHostState::CutOff;
+        let cut_offs = (0..rows.len()).filter(|i| is_cut(rows[*i]) && (*i == 0 || !is_cut(rows[*i - 1])));
         // The first record of a host has no rate yet.
         let rates = connected().skip(1).map(|row| row.rows_per_second);
         Self {
@@ -90,6 +92,7 @@ mod tests {
             record(2.0, "b", Connected, 0.0, 0),
             record(6.0, "a", Connected, 100.0, 3),
             record(7.0, "a", CutOff, 0.0, 3),
+            record(8.5, "a", CutOff, 0.0, 3),
             record(8.0, "b", Gone, 0.0, 0),
             record(9.0, "a", Connected, 300.0, 7),
             record(14.0, "a", Connected, 200.0, 7),

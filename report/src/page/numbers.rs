@@ -1,4 +1,4 @@
-//! Rounds and thins out numbers for the page's diagrams, and how many there may be.
+//! Rounds and thins out the page's numbers, and limits how many there are.
 
 use std::ops::Range;
 
@@ -26,7 +26,7 @@ pub(super) struct PageLimits {
     pub(super) pictured: usize,
     /// Pictures of such an episode.
     pub(super) pictures: usize,
-    /// Bytes of them all.
+    /// Bytes of all pictures of one such episode.
     pub(super) bytes: usize,
 }
 

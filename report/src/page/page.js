@@ -4,7 +4,7 @@ const report = JSON.parse(document.getElementById("data").textContent);
 const { runs } = report;
 const COLOURS = 6;
 const several = runs.length > 1;
-/** The results of more runs are listed only on request, so that their curves are in sight. */
+/** The table of the results is collapsed if there are more runs, so that the curves are in view. */
 const MANY = 8;
 
 /** Adds a section with its heading, and a link to it at the top of the page. */
@@ -90,7 +90,7 @@ function resultsOfAll() {
   const list = listed("The results of the runs", columns, runs);
   const words = `Results of the ${runs.length} runs`;
   const each = runs.length > MANY ? html("details", {}, html("summary", {}, words), list) : list;
-  return [...ranking(), each, aside("Returns are means over the episodes of an evaluation, without exploration; after ± stands their standard deviation.")];
+  return [...ranking(), each, aside("Returns are means over the episodes of an evaluation, without exploration. The number after ± is their standard deviation.")];
 }
 
 function result() {
@@ -116,7 +116,7 @@ function details() {
     ["last return", (run) => evaluated(run.last)],
     ["processes", incidents],
   ];
-  if (runs.some((run) => run.origin)) facts.splice(2, 0, ["beginning", (run) => run.origin ?? "networks of its own"]);
+  if (runs.some((run) => run.origin)) facts.splice(2, 0, ["began with", (run) => run.origin ?? "new networks"]);
   // The head shows these of a single run.
   if (several && runs.some((run) => run.start)) {
     facts.push(
@@ -188,7 +188,7 @@ function learning() {
     several ? "Learning curves" : "Learning curve",
     make,
     ...(runs.some((run) => run.changes.length) ? [aside("Vertical lines mark changes of the configuration.")] : []),
-    aside("Drag over a diagram to zoom in and double-click it to see everything. A click on a name in the legend hides or shows its curve. Smoothing draws the centred mean over a share of the axis, and over three points at least; the curves themselves stay, in pale."),
+    aside("Drag over a diagram to zoom in and double-click it to see everything. Click a name in the legend to hide or show its curve. Smoothing draws a centred moving mean over a share of the axis, and over at least three points. The original curve stays visible in a pale colour."),
   );
 }
 
@@ -250,7 +250,7 @@ function hosts() {
     ["round trip", (row) => (row.round_trip === null ? "–" : `${text(row.round_trip)} ms`)],
     ["policy behind", (row) => text(row.policy_lag)],
     ["resent chunks", (row) => whole(row.resent_chunks)],
-    ["cut off", (row) => plural(row.cut_offs, "time")],
+    ["cut-offs", (row) => whole(row.cut_offs)],
   ];
   section("Other hosts", listed("Other hosts of the runs", columns, rows), aside("Times are those of the run. Rows per second, round trip and how many versions the policy was behind are medians over the time while the host was connected."));
 }
@@ -271,7 +271,7 @@ function ranking() {
     const list = listed(`Settings of ${environment}, the best first`, columns, places, environment);
     return verdict ? [html("p", {}, `${verdict}.`), list] : [list];
   });
-  return [...parts, aside("These are of the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap).")];
+  return [...parts, aside("Each run counts with the mean return of its final evaluation, or of its last evaluation if it has no final one. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares come from 5,000 bootstrap resamples of the seeds.")];
 }
 
 /** The changes of the configuration, if there were any. */

@@ -26,9 +26,9 @@ pub(super) struct Played {
     /// A sentence for the reader of the page if there are no episodes.
     pub(super) why_not: Option<String>,
     picture: Picture,
-    /// Another program's environment: a sentence for the reader if an episode has no pictures.
+    /// Why an episode of an environment that another program serves has no pictures: a sentence for the reader.
     no_pictures: Option<String>,
-    /// How long a step is shown in s, if it has no duration of its own but the environment says so.
+    /// How long a step is shown, in s, by the environment's frame rate. Used only if `time_step` is `None`.
     pace: Option<f64>,
     /// Δt of a step in s; `None` if a step of the environment has no duration.
     time_step: Option<f64>,
@@ -98,7 +98,7 @@ impl Played {
             let which = (config.run.seed, number as u64);
             let (trajectory, frames) = if is_external && number < limits.pictured && no_pictures.is_none() {
                 let (trajectory, frames) = rollout.filmed_episode(which, limits.pictures, |_| ())?;
-                pace = frames.as_ref().ok().and_then(|frames| frames.fps).map(f64::recip);
+                pace = pace.or(frames.as_ref().ok().and_then(|frames| frames.fps).map(f64::recip));
                 let frames = frames.and_then(|frames| Pictures::of(&frames, limits.bytes));
                 no_pictures = frames
                     .as_ref()

@@ -3,7 +3,7 @@
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 /** Seconds per frame if a step of the environment has no duration. */
 const SECONDS_PER_FRAME = 0.5;
-/** Space means something else in these. */
+/** Elements in which the space key has another meaning. */
 const TAKES_SPACE = "input, select, textarea, button, summary, [contenteditable]";
 
 class Player {
@@ -35,7 +35,7 @@ class Player {
         this.signals,
       ),
       this.policy,
-      html("p", { class: "aside" }, "Space plays and pauses, from anywhere on the page. In the player, the arrow keys step, and Home and End jump. A click on a signal's line jumps to that step."),
+      html("p", { class: "aside" }, "Space plays and pauses, from anywhere on the page. In the player, the arrow keys step, and Home and End jump. Click a signal's line to jump to that step."),
     );
     document.addEventListener("keydown", (event) => this.keyOfPage(event));
     this.load(runs[0], 0);

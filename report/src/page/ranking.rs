@@ -99,7 +99,7 @@ fn verdict(places: &[RankedSetting]) -> Option<String> {
     };
     if best.unfinished == 0 && second.unfinished > 0 {
         return Some(format!(
-            "{} is the only setting that was trained to the end, so nothing says how certain it is the best",
+            "{} is the only setting that was trained to the end, so it is not compared with the others",
             best.label
         ));
     }
@@ -111,7 +111,7 @@ fn verdict(places: &[RankedSetting]) -> Option<String> {
         _ => "the best so far, but that may be chance",
     };
     let few = match places.iter().map(|place| place.runs).min() {
-        Some(runs) if runs < FEW => format!("; {runs} runs are few, so train more seeds to be sure"),
+        Some(runs) if runs < FEW => format!("; {runs} runs per setting are not enough to be sure: train more seeds"),
         _ => String::new(),
     };
     let others = match places.iter().filter(|place| place.best.is_some()).count() {

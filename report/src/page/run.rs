@@ -92,9 +92,9 @@ struct Curve {
     std: Vec<f64>,
     /// Number of records that the points were selected or averaged from.
     rows: usize,
-    /// What a moving mean over the points needs if they were selected from more records: the sum of the records after
-    /// the point before, up to each point, and their number. Empty if the points are all records, or means of equally
-    /// many.
+    /// For the moving mean if the points were selected from more records: for each point, the sum and the number of the
+    /// records after the previous point, up to and including this one. Empty if every record is a point, or every point
+    /// is a mean of equally many records.
     sums: Vec<f64>,
     counts: Vec<usize>,
 }

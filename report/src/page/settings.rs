@@ -8,10 +8,10 @@ pub(super) type Setting = (String, String);
 /// Settings in which repetitions may differ.
 const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
-/// Set by the program, and still a setting that distinguishes runs.
+/// Keys that the program sets but in which runs may differ.
 const ORIGIN: [&str; 2] = ["run.from", "run.demonstrations"];
 
-/// All settings in the order of `config.toml`, except most settings that the program fills in.
+/// All settings in the order of `config.toml`, except those that the program sets, apart from [`ORIGIN`].
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();

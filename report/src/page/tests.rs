@@ -3,6 +3,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::{make, names};
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::outcome::{RunOutcome, RunState};
+use shoal_run::records::recorder::IncidentKind;
 use shoal_run::testing::small;
 
 use super::numbers::POINTS;
@@ -202,6 +203,23 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     assert!((total("sums") - sum).abs() < 1.0, "{sum}");
     assert_eq!(run["incidents"]["kills"], 20_000);
     assert_eq!(run["learner"]["actor_loss"][0], serde_json::Value::Null);
+}
+
+#[test]
+fn the_time_line_has_a_sign_for_each_kind_of_incident() {
+    use IncidentKind::{Failed, Fault, GivenUp, Killed, Restarted, Resumed, Retired, Scaled, Stalled};
+    for kind in [
+        Killed, Failed, Stalled, Fault, Restarted, GivenUp, Retired, Scaled, Resumed,
+    ] {
+        let name = serde_json::to_value(kind).unwrap();
+        let name = name.as_str().unwrap();
+        let key = if name.contains('-') {
+            format!("\n  \"{name}\": [")
+        } else {
+            format!("\n  {name}: [")
+        };
+        assert!(include_str!("timeline.js").contains(&key), "{name}");
+    }
 }
 
 #[test]

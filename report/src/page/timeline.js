@@ -14,6 +14,8 @@ const ROLES = [
 const KINDS = {
   killed: ["killed", "bad", "M-5-5L5 5M-5 5L5-5"],
   failed: ["failed", "bad", "M-5-5L5 5M-5 5L5-5M-7 0H7"],
+  stalled: ["stalled", "bad", "M-5-6H5L-5 6H5Z"],
+  fault: ["invalid answer", "bad", "M0-6V2M0 4.5V6"],
   "given-up": ["given up", "bad", "M-6-6H6V6H-6Z"],
   "started-again": ["started again", "good", "M-5 4L0-5L5 4Z"],
   retired: ["retired", "calm", "M-5-4L0 5L5-4Z"],

@@ -2,7 +2,7 @@
 
 use shoal_run::evaluation::analysis::lake::{ExpectedResult, Values, greedy, risky_states, suboptimal_states};
 
-use super::super::claim::{Claim, Scope, spread};
+use super::super::claim::{Claim, spread};
 use super::super::result::SeedResult;
 use super::{EPISODES, Measurements, SettingResults};
 
@@ -16,37 +16,27 @@ pub(super) fn all(
     q_star: &Values,
     best: ExpectedResult,
 ) -> Vec<Claim> {
-    let [low, (_, good), high] = *epsilon;
+    let [low, (_, chosen), high] = *epsilon;
     vec![
-        optimal(good, q_star),
+        optimal(chosen, q_star),
         slow(epsilon, best),
-        early(low.1, good, high.1),
-        late(good, high.1),
-        state_six(good),
-        alike(good, q_star),
+        early(low.1, chosen, high.1),
+        late(chosen, high.1, q_star),
+        state_six(chosen),
+        alike(chosen, q_star),
         learning_rates(alpha),
-        on_policy(good, sarsa, q_star),
+        on_policy(chosen, sarsa, q_star),
     ]
-}
-
-fn together(thesis: &'static str, criterion: &'static str, ours: String, held: Option<bool>) -> Claim {
-    Claim {
-        thesis,
-        criterion,
-        ours,
-        scope: Scope::Together,
-        held: held.into_iter().collect(),
-    }
 }
 
 /// The probability of reaching the goal between two episodes, as mean over the seeds; NaN without seeds.
 fn reached(seeds: &[SeedResult<Measurements>], from: u64, to: u64) -> f64 {
-    mean(seeds, |tests| tests.reached(from, to))
+    mean(seeds, |measurements| measurements.reached(from, to))
 }
 
 /// The mean over the seeds; NaN without seeds.
 fn mean(seeds: &[SeedResult<Measurements>], of: impl Fn(&Measurements) -> f64) -> f64 {
-    seeds.iter().map(|seed| of(&seed.tests)).sum::<f64>() / seeds.len() as f64
+    seeds.iter().map(|seed| of(&seed.measurements)).sum::<f64>() / seeds.len() as f64
 }
 
 /// Formats a mean, or "no results" for NaN.
@@ -61,10 +51,10 @@ fn at_end(seeds: &[SeedResult<Measurements>]) -> f64 {
     reached(seeds, EPISODES - 1_000, EPISODES)
 }
 
-fn optimal(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
-    let wrong: Vec<Vec<usize>> = good
+fn optimal(chosen: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
+    let wrong: Vec<Vec<usize>> = chosen
         .iter()
-        .map(|seed| suboptimal_states(&greedy(&seed.tests.q), q_star))
+        .map(|seed| suboptimal_states(&greedy(&seed.measurements.q), q_star))
         .collect();
     let right = wrong.iter().filter(|states| states.is_empty()).count();
     let mut where_wrong: Vec<String> = wrong.iter().flatten().map(usize::to_string).collect();
@@ -73,24 +63,24 @@ fn optimal(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
         [] => String::new(),
         states => format!("; states with another action: {}", states.join(", ")),
     };
-    together(
+    Claim::together(
         "The optimal policy is learned with the good setting (ε = 0.4, α = 0.03)",
         "with at least 9 of 10 seeds, the greedy policy takes an optimal action (by value iteration) in every state",
-        format!("{right} of {} seeds{elsewhere}", good.len()),
-        (!good.is_empty()).then_some(10 * right >= 9 * good.len()),
+        format!("{right} of {} seeds{elsewhere}", chosen.len()),
+        (!chosen.is_empty()).then_some(10 * right >= 9 * chosen.len()),
     )
 }
 
 fn slow(epsilon: &[SettingResults<'_>; 3], best: ExpectedResult) -> Claim {
     let ends = epsilon.map(|(label, seeds)| (label, at_end(seeds)));
-    let there = epsilon.iter().all(|(_, seeds)| !seeds.is_empty());
-    together(
+    let have_results = epsilon.iter().all(|(_, seeds)| !seeds.is_empty());
+    Claim::together(
         "The lowest ε of 0.1 does not converge within the 10,000 episodes",
         "over the last 1,000 episodes, the mean probability of reaching the goal is more than 0.05 below the optimal \
          policy's for ε = 0.1, and not for the other two",
         ends.map(|(label, end)| format!("{label}: {}", format_mean(end, 2)))
             .join("; "),
-        there.then(|| {
+        have_results.then(|| {
             let converged = ends.map(|(_, end)| end > best.reached - SAME);
             converged == [false, true, true]
         }),
@@ -99,80 +89,81 @@ fn slow(epsilon: &[SettingResults<'_>; 3], best: ExpectedResult) -> Claim {
 
 fn early(
     low: &[SeedResult<Measurements>],
-    good: &[SeedResult<Measurements>],
+    chosen: &[SeedResult<Measurements>],
     high: &[SeedResult<Measurements>],
 ) -> Claim {
-    let [low, middle, high_mean] = [low, good, high].map(|seeds| reached(seeds, 500, 2_000));
-    together(
+    let [low_mean, middle, high_mean] = [low, chosen, high].map(|seeds| reached(seeds, 500, 2_000));
+    Claim::together(
         "ε = 0.7 looks as though it will be the best exploration rate early on",
         "between episodes 500 and 2,000, its mean probability of reaching the goal is the highest",
         format!(
             "0.1: {}; 0.4: {}; 0.7: {}",
-            format_mean(low, 3),
+            format_mean(low_mean, 3),
             format_mean(middle, 3),
             format_mean(high_mean, 3)
         ),
-        (!good.is_empty() && !high.is_empty()).then_some(high_mean > middle && high_mean > low),
+        (!low.is_empty() && !chosen.is_empty() && !high.is_empty())
+            .then_some(high_mean > middle && high_mean > low_mean),
     )
 }
 
-fn late(good: &[SeedResult<Measurements>], high: &[SeedResult<Measurements>]) -> Claim {
-    let [middle, high_mean] = [good, high].map(|seeds| reached(seeds, 5_000, 8_000));
+fn late(chosen: &[SeedResult<Measurements>], high: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
+    let [middle, high_mean] = [chosen, high].map(|seeds| reached(seeds, 5_000, 8_000));
     let start = |seeds: &[SeedResult<Measurements>]| {
-        let values = seeds.iter().map(|seed| highest(&seed.tests, 0));
+        let values = seeds.iter().map(|seed| highest(&seed.measurements, 0));
         spread(values, 2)
     };
-    together(
+    Claim::together(
         "ε = 0.7 is surpassed by ε = 0.4",
         "between episodes 5,000 and 8,000, the mean probability of reaching the goal is higher with ε = 0.4",
         format!(
-            "0.4: {}; 0.7: {}; learned values of the start state at the end (q* is 0.786): {} and {}",
+            "0.4: {}; 0.7: {}; learned values of the start state at the end (q* is {:.3}): {} and {}",
             format_mean(middle, 3),
             format_mean(high_mean, 3),
-            start(good),
+            q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            start(chosen),
             start(high)
         ),
-        (!good.is_empty() && !high.is_empty()).then_some(middle > high_mean),
+        (!chosen.is_empty() && !high.is_empty()).then_some(middle > high_mean),
     )
 }
 
-fn highest(tests: &Measurements, state: usize) -> f64 {
-    tests.q[4 * state..][..4]
+fn highest(measurements: &Measurements, state: usize) -> f64 {
+    measurements.q[4 * state..][..4]
         .iter()
         .map(|q| f64::from(*q))
         .fold(f64::NEG_INFINITY, f64::max)
 }
 
-fn state_six(good: &[SeedResult<Measurements>]) -> Claim {
+fn state_six(chosen: &[SeedResult<Measurements>]) -> Claim {
     let frozen = [0, 1, 2, 3, 4, 6, 8, 9, 10, 13, 14];
     let lowest = |seed: &SeedResult<Measurements>| {
-        let by_value = |a: &&usize, b: &&usize| highest(&seed.tests, **a).total_cmp(&highest(&seed.tests, **b));
+        let by_value =
+            |a: &&usize, b: &&usize| highest(&seed.measurements, **a).total_cmp(&highest(&seed.measurements, **b));
         frozen.iter().min_by(by_value).copied()
     };
-    let dangerous = |seed: &SeedResult<Measurements>| risky_states(&greedy(&seed.tests.q)) == [6];
-    let count = |holds: &dyn Fn(&SeedResult<Measurements>) -> bool| good.iter().filter(|seed| holds(seed)).count();
-    Claim {
-        thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its \
-                 Q-values are the lowest of all",
-        criterion: "both are true",
-        ours: format!(
+    let dangerous = |seed: &SeedResult<Measurements>| risky_states(&greedy(&seed.measurements.q)) == [6];
+    let count = |holds: &dyn Fn(&SeedResult<Measurements>) -> bool| chosen.iter().filter(|seed| holds(seed)).count();
+    Claim::each_seed(
+        "Following the policy, the only state with any possibility of falling into a hole is state 6, and its \
+         Q-values are the lowest of all",
+        "both are true",
+        format!(
             "of {} seeds, state 6 alone is dangerous in {}, and has the lowest value in {}",
-            good.len(),
+            chosen.len(),
             count(&dangerous),
             count(&|seed| lowest(seed) == Some(6))
         ),
-        scope: Scope::EachSeed,
-        held: good
-            .iter()
-            .map(|seed| dangerous(seed) && lowest(seed) == Some(6))
-            .collect(),
-    }
+        chosen.iter().map(|seed| dangerous(seed) && lowest(seed) == Some(6)),
+    )
 }
 
-fn alike(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
-    let difference = |seed: &SeedResult<Measurements>| f64::from((seed.tests.q[4 * 6] - seed.tests.q[4 * 6 + 2]).abs());
-    let [left, right] = [0, 2].map(|action| mean(good, |tests| f64::from(tests.q[4 * 6 + action])));
-    together(
+fn alike(chosen: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
+    let difference = |seed: &SeedResult<Measurements>| {
+        f64::from((seed.measurements.q[4 * 6] - seed.measurements.q[4 * 6 + 2]).abs())
+    };
+    let [left, right] = [0, 2].map(|action| mean(chosen, |measurements| f64::from(measurements.q[4 * 6 + action])));
+    Claim::together(
         "q*(6, left) = q*(6, right); the learned Q is only close to optimal",
         "the means of the two over the seeds differ by less than 0.1",
         format!(
@@ -180,32 +171,32 @@ fn alike(good: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
             format_mean(left, 3),
             format_mean(right, 3),
             q_star[6][0],
-            spread(good.iter().map(difference), 2)
+            spread(chosen.iter().map(difference), 2)
         ),
-        (!good.is_empty()).then_some((left - right).abs() < 0.1),
+        (!chosen.is_empty()).then_some((left - right).abs() < 0.1),
     )
 }
 
 fn learning_rates(alpha: &[SettingResults<'_>; 4]) -> Claim {
     let ends = alpha.map(|(label, seeds)| (label, at_end(seeds)));
-    let there = alpha.iter().all(|(_, seeds)| !seeds.is_empty());
-    together(
+    let have_results = alpha.iter().all(|(_, seeds)| !seeds.is_empty());
+    Claim::together(
         "A low learning rate leads to slow convergence, a high one may not converge; α = 0.03 is appropriate",
         "over the last 1,000 episodes, the mean probability of reaching the goal is highest with α = 0.03, and more \
          than 0.05 higher than with 0.01 and 0.3",
         ends.map(|(label, end)| format!("{label}: {}", format_mean(end, 2)))
             .join("; "),
-        there.then(|| {
-            let [low, good, middle, high] = ends.map(|(_, end)| end);
-            good > middle && good - low > SAME && good - high > SAME
+        have_results.then(|| {
+            let [low, chosen, middle, high] = ends.map(|(_, end)| end);
+            chosen > middle && chosen - low > SAME && chosen - high > SAME
         }),
     )
 }
 
-fn on_policy(good: &[SeedResult<Measurements>], sarsa: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
+fn on_policy(chosen: &[SeedResult<Measurements>], sarsa: &[SeedResult<Measurements>], q_star: &Values) -> Claim {
     let best = q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let [off, on] = [good, sarsa].map(|seeds| mean(seeds, |tests| highest(tests, 0)));
-    together(
+    let [off, on] = [chosen, sarsa].map(|seeds| mean(seeds, |measurements| highest(measurements, 0)));
+    Claim::together(
         "Q-learning approximates q* directly, without depending on the policy being followed; SARSA estimates the \
          value of the policy that explores (section 3.3.2)",
         "with the same ε and α, the learned value of the start state is nearer to q* with Q-learning, and below half \
@@ -215,7 +206,7 @@ fn on_policy(good: &[SeedResult<Measurements>], sarsa: &[SeedResult<Measurements
             format_mean(off, 2),
             format_mean(on, 2)
         ),
-        (!good.is_empty() && !sarsa.is_empty()).then_some((best - off).abs() < (best - on).abs() && on < best / 2.0),
+        (!chosen.is_empty() && !sarsa.is_empty()).then_some((best - off).abs() < (best - on).abs() && on < best / 2.0),
     )
 }
 
@@ -236,11 +227,11 @@ mod tests {
                 steps: 50.0,
             },
         });
-        let tests = Measurements {
+        let measurements = Measurements {
             q: q.iter().flatten().map(|q| *q as f32).collect(),
             evaluated: evaluated.collect(),
         };
-        result(&EXPERIMENTS[0], number, 0.7, tests)
+        result(&EXPERIMENTS[0], number, 0.7, measurements)
     }
 
     #[test]
@@ -266,7 +257,7 @@ mod tests {
         let held = |claims: Vec<Claim>| -> Vec<bool> {
             claims
                 .into_iter()
-                .map(|claim| claim.held.iter().all(|held| *held) && !claim.held.is_empty())
+                .map(|claim| claim.held().iter().all(|held| *held) && !claim.held().is_empty())
                 .collect()
         };
         assert_eq!(held(all(&epsilon, &alpha, &low, &q_star, best)), [true; 8]);
@@ -291,7 +282,11 @@ mod tests {
         assert!(
             all(&nothing, &[("", &[][..]); 4], &[], &q_star, best)
                 .iter()
-                .all(|claim| claim.held.is_empty())
+                .all(|claim| claim.held().is_empty())
+        );
+        assert!(
+            early(&[], &good, &quick).held().is_empty(),
+            "nothing is checked without the results of a setting"
         );
     }
 }

@@ -2,7 +2,7 @@
 
 use shoal_run::evaluation::analysis::point_mass::{Measures, NEAR_STARTS, REACHED};
 
-use super::super::claim::{Claim, Scope, percent, spread};
+use super::super::claim::{Claim, percent, spread};
 use super::super::result::SeedResult;
 use super::Measurements;
 
@@ -37,7 +37,7 @@ fn greatest(measures: &[Measures], measure: Measure) -> f64 {
 
 /// The best policy's mean over the starts of section 5.3.
 fn near_mean(seed: &Seed, measure: Measure) -> f64 {
-    mean(near(&seed.tests.best), measure)
+    mean(near(&seed.measurements.best), measure)
 }
 
 /// The spread over the seeds of the best policy's and the last policy's means over the starts of section 5.3.
@@ -48,24 +48,11 @@ fn best_and_last(seeds: &[Seed], measure: Measure, decimals: usize, unit: &str) 
     format!(
         "{} {unit} (last policy {} {unit})",
         spread(seeds.iter().map(|seed| near_mean(seed, measure)), decimals),
-        spread(seeds.iter().map(|seed| mean(near(&seed.tests.last), measure)), decimals)
+        spread(
+            seeds.iter().map(|seed| mean(near(&seed.measurements.last), measure)),
+            decimals
+        )
     )
-}
-
-fn claim(
-    thesis: &'static str,
-    criterion: &'static str,
-    ours: String,
-    seeds: &[Seed],
-    holds: impl Fn(&Seed) -> bool,
-) -> Claim {
-    Claim {
-        thesis,
-        criterion,
-        ours,
-        scope: Scope::EachSeed,
-        held: seeds.iter().map(holds).collect(),
-    }
 }
 
 /// Pairs of results with the same seed.
@@ -86,8 +73,8 @@ fn final_distances_text(seeds: &[Seed]) -> String {
 }
 
 fn arrival_claim(seeds: &[Seed], thesis: &'static str) -> Claim {
-    let farthest = |seed: &Seed| greatest(near(&seed.tests.best), DISTANCE);
-    claim(
+    let farthest = |seed: &Seed| greatest(near(&seed.measurements.best), DISTANCE);
+    Claim::each_seed(
         thesis,
         "from each of the four starts of section 5.3 it ends within 0.05 m of the goal",
         format!(
@@ -95,8 +82,7 @@ fn arrival_claim(seeds: &[Seed], thesis: &'static str) -> Claim {
             spread(seeds.iter().map(farthest), 3),
             final_distances_text(seeds)
         ),
-        seeds,
-        |seed| farthest(seed) < REACHED,
+        seeds.iter().map(|seed| farthest(seed) < REACHED),
     )
 }
 
@@ -106,19 +92,17 @@ pub(super) fn of_r1(seeds: &[Seed]) -> Vec<Claim> {
             seeds,
             "The vehicle learns to move from its start position to the goal; the position error converges to zero",
         ),
-        claim(
+        Claim::each_seed(
             "Once the vehicle has stopped at the goal, the applied force does not go to zero",
             "the mean force at rest is above 0.1 N (its range is 0 to 2)",
             format!("force at rest {}", best_and_last(seeds, FORCE_AT_REST, 3, "N")),
-            seeds,
-            |seed| near_mean(seed, FORCE_AT_REST) > 0.1,
+            seeds.iter().map(|seed| near_mean(seed, FORCE_AT_REST) > 0.1),
         ),
-        claim(
+        Claim::each_seed(
             "… and the direction is shaky",
             "at rest the direction changes by more than 0.1 rad a step (5 rad in 50 steps)",
             format!("turning at rest {}", best_and_last(seeds, TURNING_AT_REST, 1, "rad")),
-            seeds,
-            |seed| near_mean(seed, TURNING_AT_REST) > 5.0,
+            seeds.iter().map(|seed| near_mean(seed, TURNING_AT_REST) > 5.0),
         ),
     ]
 }
@@ -126,7 +110,7 @@ pub(super) fn of_r1(seeds: &[Seed]) -> Vec<Claim> {
 /// See [`SeedResult::learned_by`]; `None` unless the best policy reaches the goal from at least half of the starts of
 /// section 5.3.
 fn converged_by(seed: &Seed) -> Option<u64> {
-    let starts = near(&seed.tests.best);
+    let starts = near(&seed.measurements.best);
     let arrived = starts.iter().filter(|it| it.final_distance < REACHED).count();
     seed.learned_by().filter(|_| 2 * arrived >= starts.len())
 }
@@ -148,24 +132,21 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
         (_, r2) => r2.is_some(),
     };
     vec![
-        Claim {
-            thesis: "Reward r2 causes the solution to converge after only 2000 episodes, significantly less than with \
-                     r1",
-            criterion: "fewer episodes than with r1 and the same seed until an evaluation has covered nine tenths of \
-                        the way from the run's first return to its best (never, if the best policy arrives from fewer \
-                        than two of the four starts)",
-            ours: format!("episodes with r2: {}; with r1: {}", converged(r2), converged(r1)),
-            scope: Scope::EachSeed,
-            held: pairs(r1, r2).map(sooner).collect(),
-        },
-        claim(
+        Claim::each_seed(
+            "Reward r2 causes the solution to converge after only 2000 episodes, significantly less than with r1",
+            "fewer episodes than with r1 and the same seed until an evaluation has covered nine tenths of the way from \
+             the run's first return to its best (never, if the best policy arrives from fewer than two of the four \
+             starts)",
+            format!("episodes with r2: {}; with r1: {}", converged(r2), converged(r1)),
+            pairs(r1, r2).map(sooner),
+        ),
+        Claim::each_seed(
             "F_u approaches a steady value close to zero",
             "the mean force at rest is below 0.2 N, a tenth of its range",
             format!("force at rest {}", best_and_last(r2, FORCE_AT_REST, 3, "N")),
-            r2,
-            |seed| near_mean(seed, FORCE_AT_REST) < 0.2,
+            r2.iter().map(|seed| near_mean(seed, FORCE_AT_REST) < 0.2),
         ),
-        claim(
+        Claim::each_seed(
             "The vehicle remains stationary, which leads to a steady state error in position",
             "at rest the distance to the goal changes by less than 0.01 m, and at the end it is between 0.005 m and \
              0.5 m",
@@ -175,8 +156,8 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
                 best_and_last(r2, steady, 3, "m"),
                 final_distances_text(r2)
             ),
-            r2,
-            |seed| near_mean(seed, steady) < 0.01 && (0.005..0.5).contains(&near_mean(seed, DISTANCE)),
+            r2.iter()
+                .map(|seed| near_mean(seed, steady) < 0.01 && (0.005..0.5).contains(&near_mean(seed, DISTANCE))),
         ),
     ]
 }
@@ -186,40 +167,35 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
         let less = |(other, r3): (&Seed, &Seed)| near_mean(r3, FORCE_ON_THE_WAY) < near_mean(other, FORCE_ON_THE_WAY);
         pairs(others, r3).map(|pair| (pair.1.header.seed, less(pair))).collect()
     };
-    let farthest = |seed: &Seed| greatest(far(&seed.tests.best), DISTANCE);
+    let farthest = |seed: &Seed| greatest(far(&seed.measurements.best), DISTANCE);
     let least_arrived = r3.iter().map(|seed| {
-        let far = far(&seed.tests.best);
+        let far = far(&seed.measurements.best);
         far.iter().filter(|it| it.final_distance < REACHED).count() as f64 / far.len() as f64
     });
     let least_arrived = least_arrived.fold(1.0, f64::min);
     vec![
         arrival_claim(r3, "The position error converges to zero"),
-        claim(
+        Claim::each_seed(
             "F_u becomes zero when the vehicle is stopping",
             "the mean force at rest is below 0.1 N (its range is 0 to 2)",
             format!("force at rest {}", best_and_last(r3, FORCE_AT_REST, 3, "N")),
-            r3,
-            |seed| near_mean(seed, FORCE_AT_REST) < 0.1,
+            r3.iter().map(|seed| near_mean(seed, FORCE_AT_REST) < 0.1),
         ),
-        Claim {
-            thesis: "The agent applies less force than previously",
-            criterion: "the mean force until the goal is reached is smaller than with r1 and with r2 for the same seed",
-            ours: format!(
+        Claim::each_seed(
+            "The agent applies less force than previously",
+            "the mean force until the goal is reached is smaller than with r1 and with r2 for the same seed",
+            format!(
                 "force on the way with r3: {}; with r1: {}; with r2: {}",
                 best_and_last(r3, FORCE_ON_THE_WAY, 2, "N"),
                 best_and_last(r1, FORCE_ON_THE_WAY, 2, "N"),
                 best_and_last(r2, FORCE_ON_THE_WAY, 2, "N")
             ),
-            scope: Scope::EachSeed,
-            held: less_than(r1)
-                .into_iter()
-                .filter_map(|(seed, less)| {
-                    let than_r2 = less_than(r2).into_iter().find(|(other, _)| *other == seed)?.1;
-                    Some(less && than_r2)
-                })
-                .collect(),
-        },
-        claim(
+            less_than(r1).into_iter().filter_map(|(seed, less)| {
+                let than_r2 = less_than(r2).into_iter().find(|(other, _)| *other == seed)?.1;
+                Some(less && than_r2)
+            }),
+        ),
+        Claim::each_seed(
             "Paths taken when the starting position is further from the goal (appendix A.2) end at the goal too",
             "from each of the eight starts of appendix A.2 it ends within 0.05 m of the goal",
             format!(
@@ -227,29 +203,24 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
                 spread(r3.iter().map(farthest), 3),
                 percent(least_arrived)
             ),
-            r3,
-            |seed| farthest(seed) < REACHED,
+            r3.iter().map(|seed| farthest(seed) < REACHED),
         ),
     ]
 }
 
 pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
-    let turning = |seed: &Seed| mean(&seed.tests.best, TURNING);
+    let turning = |seed: &Seed| mean(&seed.measurements.best, TURNING);
     let turnings = |seeds: &[Seed]| spread(seeds.iter().map(turning), 1);
-    let calmer = |thesis, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| Claim {
-        thesis,
-        criterion,
-        ours: format!(
+    let calmer = |thesis, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| {
+        let ours = format!(
             "turning from all twelve starts: {} rad with {}, {} rad with {}",
             turnings(seeds),
             names[0],
             turnings(than),
             names[1]
-        ),
-        scope: Scope::EachSeed,
-        held: pairs(than, seeds)
-            .map(|(than, it)| turning(it) < turning(than))
-            .collect(),
+        );
+        let held = pairs(than, seeds).map(|(than, it)| turning(it) < turning(than));
+        Claim::each_seed(thesis, criterion, ours, held)
     };
     vec![
         calmer(
@@ -280,21 +251,21 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
 /// training.
 pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     let value = |before: &Seed, after: &Seed, measure: Measure| {
-        (near_mean(before, measure), mean(near(&after.tests.last), measure))
+        (
+            near_mean(before, measure),
+            mean(near(&after.measurements.last), measure),
+        )
     };
-    let check = |thesis, criterion, what: &str, measure: Measure, decimals, holds: fn(f64, f64) -> bool| Claim {
-        thesis,
-        criterion,
-        ours: format!(
+    let check = |thesis, criterion, what: &str, measure: Measure, decimals, holds: fn(f64, f64) -> bool| {
+        let ours = format!(
             "{what}: best policy of the first training {}; last policy of the additional training {}",
             spread(pairs(before, after).map(|(b, a)| value(b, a, measure).0), decimals),
             spread(pairs(before, after).map(|(b, a)| value(b, a, measure).1), decimals)
-        ),
-        scope: Scope::EachSeed,
-        held: pairs(before, after)
+        );
+        let held = pairs(before, after)
             .map(|(b, a)| value(b, a, measure))
-            .map(|(b, a)| holds(b, a))
-            .collect(),
+            .map(|(b, a)| holds(b, a));
+        Claim::each_seed(thesis, criterion, ours, held)
     };
     vec![
         check(
@@ -314,11 +285,11 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
             1,
             |before, after| after > before,
         ),
-        Claim {
-            thesis: "Early stopping is the most important regularisation: an agent that trains for too long gets worse",
-            criterion: "in the final evaluation, the last policy of the additional training has a lower return than \
-                        the best policy of the first training",
-            ours: format!(
+        Claim::each_seed(
+            "Early stopping is the most important regularisation: an agent that trains for too long gets worse",
+            "in the final evaluation, the last policy of the additional training has a lower return than the best \
+             policy of the first training",
+            format!(
                 "first training: best policy {}, last policy {}; after the additional training: last policy {}, best \
                  policy of both {}",
                 spread(before.iter().map(|seed| seed.best.evaluation.return_mean), 1),
@@ -326,11 +297,9 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
                 spread(after.iter().map(|seed| seed.last.evaluation.return_mean), 1),
                 spread(after.iter().map(|seed| seed.best.evaluation.return_mean), 1)
             ),
-            scope: Scope::EachSeed,
-            held: pairs(before, after)
-                .map(|(before, after)| after.last.evaluation.return_mean < before.best.evaluation.return_mean)
-                .collect(),
-        },
+            pairs(before, after)
+                .map(|(before, after)| after.last.evaluation.return_mean < before.best.evaluation.return_mean),
+        ),
     ]
 }
 
@@ -340,7 +309,7 @@ mod tests {
     use super::*;
 
     fn held(claims: Vec<Claim>) -> Vec<Vec<bool>> {
-        claims.into_iter().map(|claim| claim.held).collect()
+        claims.into_iter().map(|claim| claim.held()).collect()
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::Measurements;
 pub(super) struct RewardFigures {
     name: &'static str,
     curve: &'static str,
-    tests: &'static str,
+    test_runs: &'static str,
     /// The test runs of a result that the thesis shows.
     shown: Range<usize>,
 }
@@ -20,19 +20,19 @@ pub(super) struct RewardFigures {
 pub(super) const R1: RewardFigures = RewardFigures {
     name: "r1",
     curve: "5.4",
-    tests: "5.5",
+    test_runs: "5.5",
     shown: 0..2,
 };
 pub(super) const R2: RewardFigures = RewardFigures {
     name: "r2",
     curve: "5.6",
-    tests: "5.7",
+    test_runs: "5.7",
     shown: 2..4,
 };
 const R3: RewardFigures = RewardFigures {
     name: "r3",
     curve: "5.8",
-    tests: "5.9",
+    test_runs: "5.9",
     shown: 0..2,
 };
 
@@ -52,7 +52,7 @@ pub(super) fn of_reward(
     let RewardFigures {
         name,
         curve,
-        tests,
+        test_runs,
         shown,
     } = of;
     let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
@@ -65,10 +65,10 @@ pub(super) fn of_reward(
         writer.add(
             &format!("point-mass-{name}-test-runs"),
             format!(
-                "Two test runs with {name}, seed {} (figure {tests})",
+                "Two test runs with {name}, seed {} (figure {test_runs})",
                 middle.header.seed
             ),
-            |path| figure::test_runs(&middle.tests.test_runs[shown.clone()], path),
+            |path| figure::test_runs(&middle.measurements.test_runs[shown.clone()], path),
         )?,
     ])
 }
@@ -83,7 +83,7 @@ pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Measurements>]) -
                 middle.header.seed
             );
             figures.push(writer.add(&format!("point-mass-r3-{file}"), caption, |path| {
-                figure::test_runs(&middle.tests.test_runs[range], path)
+                figure::test_runs(&middle.measurements.test_runs[range], path)
             })?);
         }
     }
@@ -101,7 +101,7 @@ pub(super) fn of_comparison(
             let middle = representative(seeds)?;
             Some(Agent {
                 name: format!("{name} (seed {})", middle.header.seed),
-                test_runs: middle.tests.test_runs[NEAR].iter().collect(),
+                test_runs: middle.measurements.test_runs[NEAR].iter().collect(),
             })
         })
         .collect();
@@ -138,7 +138,7 @@ pub(super) fn of_longer(writer: &FigureWriter, seeds: &[SeedResult<Measurements>
                 "Two test runs of the last policy after additional training with r2, seed {} (figures A.1 and A.2)",
                 middle.header.seed
             ),
-            |path| figure::test_runs(&middle.tests.last_test_runs[R2.shown.clone()], path),
+            |path| figure::test_runs(&middle.measurements.last_test_runs[R2.shown.clone()], path),
         )?,
         writer.add(
             "point-mass-r2-longer-learning-curve",

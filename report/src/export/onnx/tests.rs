@@ -90,7 +90,7 @@ fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
 }
 
 #[test]
-fn states_and_actions_are_counted_as_the_environment_counts_them() {
+fn states_and_actions_have_the_environments_own_numbers() {
     let (config, policy) = with_starts();
     let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
     let model = Model::load(bytes).unwrap();
@@ -135,8 +135,8 @@ fn actions_of_the_model_stay_inside_the_bounds() {
     }
 }
 
-/// This checks the model's attribute, not the result: the runtime of these tests ignores it and returns the last of
-/// equals.
+/// Checks the attribute, not the result: the runtime of these tests ignores the attribute and returns the last of equal
+/// scores.
 #[test]
 fn the_model_requests_the_first_of_equal_scores() {
     let (config, policy) = policies().pop().unwrap();

@@ -6,11 +6,13 @@ use anyhow::Context;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 use shoal_env_server::frame::Image;
 
+use super::FilmFailure;
+
 /// How carefully the colours of a picture with more than 256 are chosen: 1 is best, 30 is fastest.
 const SPEED: i32 = 10;
 
 /// Writes pictures one after the other. Each is stored as its difference from the picture before.
-pub(super) struct Animation<W: Write> {
+pub(super) struct GifEncoder<W: Write> {
     encoder: Encoder<W>,
     width: usize,
     height: usize,
@@ -19,7 +21,7 @@ pub(super) struct Animation<W: Write> {
     pending: Option<Frame<'static>>,
 }
 
-impl<W: Write> Animation<W> {
+impl<W: Write> GifEncoder<W> {
     /// A film of pictures of this size that begins again when it has ended.
     pub(super) fn new(writer: W, (width, height): (usize, usize)) -> anyhow::Result<Self> {
         let side = |pixels: usize| u16::try_from(pixels).context("the pictures are too large for a GIF");
@@ -51,7 +53,7 @@ impl<W: Write> Animation<W> {
     }
 
     /// Writes what is left.
-    pub(super) fn finish(mut self) -> anyhow::Result<()> {
+    pub(super) fn finish(mut self) -> Result<(), FilmFailure> {
         if let Some(last) = self.pending.take() {
             self.encoder.write_frame(&last)?;
         }
@@ -139,7 +141,7 @@ pub(super) mod tests {
             })
         };
         let mut bytes = Vec::new();
-        let mut film = Animation::new(&mut bytes, (40, 30)).unwrap();
+        let mut film = GifEncoder::new(&mut bytes, (40, 30)).unwrap();
         for (at, delay) in [(1, 3), (1, 4), (2, 5), (6, 7)] {
             film.add(&square(at), delay).unwrap();
         }
@@ -147,11 +149,31 @@ pub(super) mod tests {
         assert_eq!(decoded(&bytes), [(square(1), 7), (square(2), 5), (square(6), 7)]);
     }
 
+    /// A file that cannot be written to its end.
+    struct Full;
+
+    impl Write for Full {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Err(std::io::ErrorKind::StorageFull.into())
+        }
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_to_its_end_is_told_from_other_failures() {
+        let mut film = GifEncoder::new(Full, (40, 30)).unwrap();
+        film.add(&picture(|_, _| [255; 3]), 2).unwrap();
+        assert!(matches!(film.finish(), Err(FilmFailure::File(_))));
+    }
+
     #[test]
     fn many_colours_are_nearly_kept() {
         let colourful = picture(|x, y| [(6 * x) as u8, (8 * y) as u8, (3 * x + 4 * y) as u8]);
         let mut bytes = Vec::new();
-        let mut film = Animation::new(&mut bytes, (40, 30)).unwrap();
+        let mut film = GifEncoder::new(&mut bytes, (40, 30)).unwrap();
         film.add(&picture(|_, _| [255; 3]), 2).unwrap();
         film.add(&colourful, 2).unwrap();
         film.finish().unwrap();
