@@ -31,7 +31,7 @@ fn main() -> ExitCode {
             the_default_run_fits_into_a_container_and_one_with_64_actors_is_refused,
             NAMESPACE
         ),
-        test!(memory_promised_to_another_run_is_not_free, NAMESPACE),
+        test!(memory_reserved_for_another_run_is_not_free, NAMESPACE),
         test!(leftovers_that_cannot_be_removed_do_not_prevent_a_start, NAMESPACE),
         test!(a_full_disk_is_reported_before_anything_is_created, NAMESPACE),
         test!(a_disk_that_fills_up_ends_the_run_with_one_line, NAMESPACE),
@@ -147,8 +147,8 @@ fn a_run_reserves_at_most_the_computed_memory_and_at_least_half_of_it() {
         });
         until("something is learned", || running.learned("updates") > 0);
         let files = files_of(&running);
-        let promised = |path: &PathBuf| path.to_str()?.split_once("_promise_")?.1.parse().ok();
-        let computed: u64 = files.iter().find_map(promised).unwrap();
+        let recorded = |path: &PathBuf| path.to_str()?.split_once("_reserved_")?.1.parse().ok();
+        let computed: u64 = files.iter().find_map(recorded).unwrap();
         let reserved: u64 = files
             .iter()
             .map(|path| fs::metadata(path).unwrap().len().next_multiple_of(PAGE))
@@ -191,10 +191,10 @@ fn leftovers_that_cannot_be_removed_do_not_prevent_a_start() {
     assert_eq!(json(&output)["env_steps"], 300);
 }
 
-fn memory_promised_to_another_run_is_not_free() {
+fn memory_reserved_for_another_run_is_not_free() {
     let place = Workplace::new();
     let script = "$SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
-        timeout 60 sh -c 'until ls /dev/shm | grep -q promise; do sleep 0.05; done'
+        timeout 60 sh -c 'until ls /dev/shm | grep -q reserved; do sleep 0.05; done'
         $SHOAL train pendulum --steps 100 --run second --json || code=$?
         kill $first; wait $first || true
         exit $code";
@@ -380,7 +380,7 @@ fn another_users_files_with_the_name_of_a_run_change_nothing() {
     until("every role is ready", || log().contains("every role is ready"));
     let id = Leftovers::of(&run).run_id().to_owned();
 
-    for name in ["x", "y.global_mgmt", "promise_1", "0_0.connection"] {
+    for name in ["x", "y.global_mgmt", "reserved_1", "0_0.connection"] {
         let path = PathBuf::from(format!("/dev/shm/shoal_{id}_{name}"));
         fs::write(&path, "").unwrap();
         chown(&path, Some(OTHER), Some(OTHER)).unwrap();

@@ -19,7 +19,6 @@ use shoal_common::channel::environment::{
     EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult,
 };
 use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
-use shoal_common::channel::reports::{Report, Reporter};
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
 use shoal_common::commit::CommitReader;
@@ -34,6 +33,7 @@ use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::actor_snapshot::ActorSnapshot;
 use crate::environment::{after_fault, connect};
+use crate::episode_reports::EpisodeReports;
 use crate::error::ActorError;
 use crate::exploration::{Exploration, StepCounts};
 use crate::n_step::NStepTransitions;
@@ -41,16 +41,12 @@ use crate::n_step::NStepTransitions;
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// In this time an actor reports at most half as many episodes as their channel holds. The launcher reads the channel
-/// at least twice in it, so that no report is lost.
-const REPORT_SPAN: Duration = Duration::from_millis(40);
-
 /// The settings of an actor.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
     /// Which process this is.
     pub instance: RoleInstance,
-    /// The run's configuration. In lockstep, the actor waits for the policy of each round.
+    /// The run's configuration.
     pub config: Config,
     /// Environments stepped at once.
     envs: usize,
@@ -111,7 +107,7 @@ struct Actor<'a> {
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
-    episodes: Reporter<EpisodeReport>,
+    episodes: EpisodeReports,
     returns: Vec<f64>,
     lengths: Vec<u32>,
     actions: Vec<f32>,
@@ -121,12 +117,8 @@ struct Actor<'a> {
     snapshot: Option<ActorSnapshot>,
     /// When it first noticed that the whole run is ending.
     ending_since: Option<Instant>,
-    /// Episodes that ended in the chunk that is being filled.
-    ended: Vec<EpisodeReport>,
-    /// When the current [`REPORT_SPAN`] began, and the episodes reported in it.
-    reported: (Instant, usize),
-    /// Whether the environment server has begun no episode for this actor yet.
-    server_is_new: bool,
+    /// Invalid answers of the environment server since this process began.
+    faults: u64,
 }
 
 impl<'a> Actor<'a> {
@@ -185,16 +177,14 @@ impl<'a> Actor<'a> {
             step: 0,
             snapshot,
             ending_since: None,
-            ended: Vec::new(),
-            reported: (Instant::now(), 0),
-            server_is_new: true,
+            faults: 0,
             n_step: NStepTransitions::new(settings.n_step, settings.envs, row),
             chunk: sender.begin()?,
             policy_version: 0,
             sender,
             commits,
             heartbeat,
-            episodes: Reporter::open(domain)?,
+            episodes: EpisodeReports::open(domain)?,
             returns: vec![0.0; settings.envs],
             lengths: vec![0; settings.envs],
             actions: vec![0.0; settings.envs * row.action_width()],
@@ -205,11 +195,9 @@ impl<'a> Actor<'a> {
     fn run(&mut self) -> Exit<ActorError> {
         loop {
             match self.run_until_server_lost() {
-                Ok(()) => {
-                    self.server_is_new = true;
-                    tracing::warn!("the environment server was restarted");
-                }
+                Ok(()) => tracing::warn!("the environment server was restarted"),
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    self.faults += 1;
                     if let Err(exit) = after_fault(&error, &mut self.heartbeat, &self.listener, self.stop) {
                         return exit.convert();
                     }
@@ -222,14 +210,13 @@ impl<'a> Actor<'a> {
     /// Drops the current episodes and begins new ones. In lockstep it continues the episodes of the last snapshot
     /// instead, if there is one.
     fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
-        let server_is_new = std::mem::replace(&mut self.server_is_new, false);
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
             return self.reset(ResetRequest::Next);
         }
         self.chunk.clear();
-        self.ended.clear();
+        self.episodes.clear();
         if let Some(snapshot) = &self.snapshot {
             self.step = snapshot.step;
             self.exploration.restore(&snapshot.exploration);
@@ -248,14 +235,15 @@ impl<'a> Actor<'a> {
         // A row of n steps is complete n − 1 steps after it began.
         let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
-        // A new server would begin with episode 0 again, and repeat its random numbers. There are never fewer steps than
-        // episodes. After an invalid answer another episode begins: the same one may end in the same way.
-        let request = if server_is_new || sent == 0 {
-            ResetRequest::Training(self.step)
-        } else {
-            ResetRequest::Next
+        // The number is explicit, because a new server would begin with episode 0 again. Each step and each fault
+        // begins at most one episode of an environment, so no row that this process has sent is of this episode or a
+        // later one. After an invalid answer another episode begins, because the same one may end in the same way. With
+        // snapshots it is the same one: there the bits must not depend on what was not sent.
+        let faults = match self.settings.chunk.actor_snapshot_words {
+            0 => self.faults,
+            _ => 0,
         };
-        self.reset(request)
+        self.reset(ResetRequest::Training(self.step + faults))
     }
 
     fn reset(&mut self, request: ResetRequest) -> Result<EnvironmentResponse, Exit<ActorError>> {
@@ -310,7 +298,7 @@ impl<'a> Actor<'a> {
     /// Whether the chunk is full or, if a chunk is one episode, the episode is over.
     fn chunk_is_complete(&self) -> bool {
         let episode_is_over = self.settings.config.algorithm.properties().transition_use == TransitionUse::Episodes
-            && !self.ended.is_empty();
+            && self.episodes.has_ended();
         self.chunk.is_full() || episode_is_over
     }
 
@@ -396,7 +384,7 @@ impl<'a> Actor<'a> {
             self.returns[e] += f64::from(transition.r);
             self.lengths[e] += 1;
             if transition.last {
-                self.ended.push(EpisodeReport {
+                self.episodes.push(EpisodeReport {
                     actor: self.settings.instance.index,
                     environment: e as u32,
                     steps: self.lengths[e],
@@ -478,18 +466,7 @@ impl<'a> Actor<'a> {
         let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
         self.sender.send(chunk, self.policy_version)?;
         self.learner.notify();
-        for episode in self.ended.drain(..) {
-            let (since, count) = &mut self.reported;
-            if since.elapsed() >= REPORT_SPAN {
-                (*since, *count) = (Instant::now(), 0);
-            } else if *count == EpisodeReport::BUFFER / 2 {
-                // The launcher must have read these: a full channel loses its oldest reports.
-                std::thread::sleep(REPORT_SPAN);
-                (*since, *count) = (Instant::now(), 0);
-            }
-            *count += 1;
-            self.episodes.send(episode);
-        }
+        self.episodes.send();
         Ok(())
     }
 

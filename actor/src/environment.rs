@@ -10,7 +10,7 @@ use shoal_common::stop::Stop;
 
 use crate::error::ActorError;
 
-/// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
+/// The end of the log line about an invalid answer of an environment server. The launcher looks for it.
 pub const EPISODES_DROPPED: &str = "its episodes are given up";
 
 /// How long an actor waits after an invalid answer before it begins new episodes.
@@ -27,16 +27,11 @@ pub(crate) fn connect(
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
     let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
-    if !served.matches(spec) || served_envs != envs {
-        let served = format!("{served_envs} times {served:?}");
-        let configured = format!("{envs} times {spec:?}");
-        return Err(Exit::Failed(ActorError::Server {
-            index,
-            served,
-            configured,
-        }));
+    let counts = || (served_envs != envs).then(|| format!("it has {served_envs} environments instead of {envs}"));
+    match served.difference(spec).or_else(counts) {
+        Some(difference) => Err(Exit::Failed(ActorError::Server { index, difference })),
+        None => Ok(client),
     }
-    Ok(client)
 }
 
 /// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the

@@ -23,21 +23,25 @@ pub enum ActorError {
     EvaluatorState(#[from] EvaluatorStateError),
     /// The evaluator's state cannot be written.
     #[error("cannot write the evaluator's state: {0}; free some space or check the permissions of the run directory")]
-    State(std::io::Error),
+    WriteEvaluatorState(std::io::Error),
     /// The policy cannot act in this environment.
     #[error(transparent)]
-    Actions(#[from] PolicyError),
+    Policy(#[from] PolicyError),
     /// The snapshot in the replay does not fit the actor.
-    #[error("the actor's snapshot in the replay does not fit the run's config.toml; was it edited?")]
+    #[error(
+        "the actor's snapshot in the replay does not fit the run's configuration; was config/used.toml or replay.bin \
+         edited or exchanged?"
+    )]
     Snapshot,
     /// The environment server serves other environments than the run's configuration has.
-    #[error("environment server {index} serves {served}, but the run's config.toml asks for {configured}")]
+    #[error(
+        "environment server {index} does not serve the run's environment: {difference}; was the environment or its \
+         program changed?"
+    )]
     Server {
         /// Index of the environment server.
         index: u32,
-        /// What it serves.
-        served: String,
-        /// What it should serve.
-        configured: String,
+        /// What differs, in words.
+        difference: String,
     },
 }

@@ -1,6 +1,7 @@
 //! The evaluator: runs the newest policy without exploration, always from the same start states, and keeps the best
 //! one.
 
+use std::num::NonZeroU32;
 use std::path::Path;
 use std::rc::Rc;
 
@@ -111,9 +112,9 @@ struct Evaluator<'a> {
     client: EnvironmentClient,
     reader: PolicyReader,
     policy: Policy,
-    reports: Reporter<EvaluationReport>,
+    evaluations: Reporter<EvaluationReport>,
     state: EvaluatorState,
-    evaluated_reports: Reporter<EvaluatedPeriod>,
+    periods: Reporter<EvaluatedPeriod>,
     heartbeat: HeartbeatSender,
     actions: Vec<f32>,
     /// The period of the policy evaluated last.
@@ -133,7 +134,8 @@ struct EvaluatedPolicy {
 }
 
 impl EvaluatedPolicy {
-    /// The one that a previous evaluator kept in this file. Earlier versions may have kept one that diverged.
+    /// The best policy that a previous evaluator kept in this file. One that diverged is ignored: earlier versions of
+    /// the program may have kept one.
     fn kept(path: &Path, layout: &PolicyLayout) -> Result<Option<Self>, PolicyFileError> {
         let kept = PolicyFile::read_if_any(path, layout)?.filter(|kept| kept.return_mean.is_finite());
         Ok(kept.map(|kept| Self {
@@ -167,15 +169,15 @@ impl<'a> Evaluator<'a> {
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = EvaluatedPolicy::kept(&settings.run.best_policy(), &layout)?;
         let state = EvaluatorState::read(&settings.run.evaluator_state())?;
-        // The launcher compares what the evaluator begins with after failures.
+        // After failures, the launcher compares the versions that the evaluator begins with.
         heartbeat.set_policy_version(state.last().map_or(0, |evaluation| evaluation.policy_version));
         heartbeat.beat(Activity::WaitingForPeer);
-        let reports = Reporter::open(domain)?;
+        let evaluations = Reporter::open(domain)?;
         // The launcher skips evaluations that it has already recorded.
-        state.evaluations().for_each(|evaluation| reports.send(*evaluation));
-        let evaluated_reports = Reporter::open(domain)?;
+        state.evaluations().for_each(|evaluation| evaluations.send(*evaluation));
+        let periods = Reporter::open(domain)?;
         if let Some(period) = settings.evaluated_period {
-            evaluated_reports.send(EvaluatedPeriod { period });
+            periods.send(EvaluatedPeriod { period });
         }
         Ok(Self {
             settings,
@@ -183,8 +185,8 @@ impl<'a> Evaluator<'a> {
             learner: Notifier::new(domain, EventName(Role::Learner, 0))?,
             client,
             reader,
-            reports,
-            evaluated_reports,
+            evaluations,
+            periods,
             state,
             heartbeat,
             actions: vec![0.0; settings.envs * settings.config.spec.action.width()],
@@ -222,9 +224,9 @@ impl<'a> Evaluator<'a> {
         // Before the report: if this process dies in between, its successor sends the report.
         self.state
             .add(evaluation, &self.settings.run.evaluator_state())
-            .map_err(ActorError::State)?;
-        self.reports.send(evaluation);
-        self.evaluated_reports.send(EvaluatedPeriod { period });
+            .map_err(ActorError::WriteEvaluatorState)?;
+        self.evaluations.send(evaluation);
+        self.periods.send(EvaluatedPeriod { period });
         self.learner.notify();
         Ok(())
     }
@@ -268,7 +270,6 @@ impl<'a> Evaluator<'a> {
                 Err(exit) => return Err(exit),
             }
         }
-        returns.truncate(episodes as usize);
         Ok(returns)
     }
 
@@ -281,8 +282,8 @@ impl<'a> Evaluator<'a> {
             listener,
             stop,
             heartbeat,
-            reports,
-            evaluated_reports,
+            evaluations,
+            periods,
             ..
         } = self;
         let due = |header: &PolicyHeader| {
@@ -294,8 +295,8 @@ impl<'a> Evaluator<'a> {
             || Ok(reader.latest()?.filter(|policy| due(policy.header()))),
             || {
                 heartbeat.beat(Activity::WaitingForPeer);
-                reports.refresh_connections();
-                evaluated_reports.refresh_connections();
+                evaluations.refresh_connections();
+                periods.refresh_connections();
                 Ok(())
             },
         )?;
@@ -320,7 +321,9 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         // No environment is reset more often than an episode is needed.
-        let episodes = episodes_left.min(self.settings.envs as u32);
+        let Some(episodes) = NonZeroU32::new(episodes_left.min(self.settings.envs as u32)) else {
+            return Ok(Some(Vec::new()));
+        };
         let request = ResetRequest::Evaluation {
             first: first.into(),
             episodes,
@@ -330,7 +333,7 @@ impl<'a> Evaluator<'a> {
         });
         let mut current = begun.map_err(Exit::convert)?;
         let mut returns = vec![0.0; self.settings.envs];
-        let mut running: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes).collect();
+        let mut running: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes.get()).collect();
         while running.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));
@@ -350,6 +353,7 @@ impl<'a> Evaluator<'a> {
                 return Err(Exit::Stopped);
             }
         }
+        returns.truncate(episodes.get() as usize);
         Ok(Some(returns))
     }
 

@@ -3,6 +3,7 @@
 pub mod actor;
 mod actor_snapshot;
 pub mod environment;
+mod episode_reports;
 pub mod error;
 pub mod evaluator;
 pub mod exploration;

@@ -1,8 +1,8 @@
 //! The size of an actor's snapshot between two chunks. The actor reads and writes the snapshot; chunks and the replay
 //! have room for it.
 
-/// The parts of an actor's snapshot, in words (`u64`). They follow each other in this order, except that the actor's step
-/// comes after those of the environments.
+/// The parts of an actor's snapshot, in words (`u64`). They follow each other in this order, with one word more after
+/// `environments`: the actor's step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActorSnapshotLayout {
     /// Words of the environments, as their server returns them.

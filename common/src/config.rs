@@ -259,6 +259,7 @@ impl Config {
         self.run.check()?;
         self.environment.check()?;
         environment::check_spec(&self.spec)?;
+        self.check_episodes()?;
         self.actors.check()?;
         self.algorithm.check()?;
         self.algorithm
@@ -289,6 +290,23 @@ impl Config {
         } else {
             format!("one of {}, or another environment", names.join(", "))
         }
+    }
+
+    /// Checks that an episode fits into a chunk, if the algorithm learns from whole episodes.
+    fn check_episodes(&self) -> Result<(), OutOfRange> {
+        let algorithm = self.algorithm.properties();
+        let (limit, most) = (self.spec.time_limit, ActorsConfig::MAX_CHUNK_STEPS);
+        if algorithm.transition_use != TransitionUse::Episodes || limit <= most {
+            return Ok(());
+        }
+        Err(OutOfRange {
+            key: "spec.time_limit".into(),
+            value: limit.to_string(),
+            expected: format!(
+                "at most {most}: {} learns from whole episodes, each in a chunk of its own",
+                algorithm.name
+            ),
+        })
     }
 
     /// Checks the algorithm's requirements on the collection of transitions.
@@ -360,6 +378,16 @@ mod tests {
         assert_eq!(
             sized((1 << 24) + 1).unwrap_err().to_string(),
             "spec.observation = 16777217 indices: must be at most 16777216 (2^24) indices: choose an environment with fewer"
+        );
+    }
+
+    #[test]
+    fn a_time_limit_is_named_if_an_episode_does_not_fit_into_a_chunk() {
+        let text = MINIMAL.replace("time_limit = 200", "time_limit = 4097");
+        assert!(parse(&text).is_ok());
+        assert_eq!(
+            parse(&format!("{text}[reinforce]\n")).unwrap_err().to_string(),
+            "spec.time_limit = 4097: must be at most 4096: reinforce learns from whole episodes, each in a chunk of its own"
         );
     }
 

@@ -23,7 +23,7 @@ pub struct EvaluatorState {
 
 /// Why the state cannot be read.
 #[derive(Debug, thiserror::Error)]
-#[error("{path} {cause}")]
+#[error("{path} {cause}; move it away, and the evaluator starts without saved evaluations")]
 pub struct EvaluatorStateError {
     path: String,
     cause: SealError,

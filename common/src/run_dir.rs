@@ -1,5 +1,7 @@
 //! The run directory, which contains all files of a run.
 
+mod not_a_run;
+
 use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
 use std::ops::Deref;
@@ -26,8 +28,13 @@ pub enum RunDirError {
     #[error("{0} exists already; choose another directory, or remove it")]
     Exists(PathBuf),
     /// There is no run in this directory.
-    #[error("{0} is not a run directory: {why}{hint}", why = what_it_is(.0), hint = did_you_mean(.0))]
-    NotARun(PathBuf),
+    #[error("{path} is not a run directory: {why}")]
+    NotARun {
+        /// The directory.
+        path: PathBuf,
+        /// What it is instead, and perhaps which one was meant.
+        why: String,
+    },
     /// Another launcher is running the run.
     #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
     Busy(PathBuf),
@@ -47,54 +54,6 @@ pub enum RunDirError {
         /// The system's reason.
         cause: io::Error,
     },
-}
-
-fn what_it_is(path: &Path) -> String {
-    if !path.exists() {
-        "there is no such directory".into()
-    } else if path.join("suite.json").is_file() {
-        suite(path)
-    } else {
-        "it has no config.toml".into()
-    }
-}
-
-/// A suite in words: its runs that have begun, and how to name one.
-fn suite(path: &Path) -> String {
-    let entries = std::fs::read_dir(path).into_iter().flatten().flatten();
-    let begun = entries.filter(|entry| entry.path().join("config.toml").is_file());
-    let mut runs: Vec<String> = begun
-        .map(|run| run.file_name().to_string_lossy().into_owned())
-        .collect();
-    // seed=2 before seed=10.
-    runs.sort_by(|a, b| (a.len(), a).cmp(&(b.len(), b)));
-    let here = path.display();
-    let Some(first) = runs.first() else {
-        return format!("it is a suite, and none of its runs has begun: shoal resume {here}");
-    };
-    let shown = runs.iter().take(MAX_NAMED_RUNS).cloned().collect::<Vec<_>>().join(", ");
-    let others = match runs.len().saturating_sub(MAX_NAMED_RUNS) {
-        0 => String::new(),
-        others => format!(", and {others} more, which `shoal list {here}` shows"),
-    };
-    let one = path.join(first);
-    format!(
-        "it is a suite of runs ({shown}{others}); name one of them, as in {}",
-        one.display()
-    )
-}
-
-/// At most this many runs of a suite are named in an error.
-const MAX_NAMED_RUNS: usize = 3;
-
-/// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
-fn did_you_mean(path: &Path) -> String {
-    let there = Path::new("runs").join(path);
-    if path.components().count() == 1 && there.join("config.toml").is_file() {
-        format!("; did you mean {}?", there.display())
-    } else {
-        String::new()
-    }
 }
 
 /// The first line of `config/used.toml`.
@@ -242,7 +201,10 @@ impl RunDir {
     /// When there is no run in it.
     pub fn open(path: &Path) -> Result<Self, RunDirError> {
         if !path.join("config.toml").is_file() {
-            return Err(RunDirError::NotARun(path.to_owned()));
+            return Err(RunDirError::NotARun {
+                path: path.to_owned(),
+                why: not_a_run::reason(path),
+            });
         }
         let path = std::fs::canonicalize(path).map_err(|cause| RunDirError::Io {
             action: "resolve",
@@ -574,7 +536,7 @@ mod tests {
             ("pendulum-1", "pendulum-2")
         );
         assert!(matches!(RunDir::create(first.path()), Err(RunDirError::Exists(_))));
-        assert!(matches!(RunDir::open(first.path()), Err(RunDirError::NotARun(_))));
+        assert!(matches!(RunDir::open(first.path()), Err(RunDirError::NotARun { .. })));
 
         // A name that no file system takes.
         let nowhere = parent.path().join("a/b").join("x".repeat(300)).join("run");

@@ -72,7 +72,7 @@ fn client(text: &str) -> Result<(Role, u32), String> {
     let role = [Role::Actor, Role::Evaluator]
         .into_iter()
         .find(|known| known.name() == role);
-    let index = index.parse().map_err(|_| "its index is no number")?;
+    let index = index.parse().map_err(|_| "its index is not a number")?;
     Ok((role.ok_or("must be actor or evaluator")?, index))
 }
 

@@ -50,7 +50,9 @@ pub fn serve(
                 let refused = request
                     .respond(|actions, blocks| environments.step(actions, blocks))?
                     .err();
-                heartbeat.count(environments.count() as u64);
+                if refused.is_none() {
+                    heartbeat.count(environments.count() as u64);
+                }
                 heartbeat.beat(Activity::Working);
                 refused
             }
@@ -142,6 +144,10 @@ mod tests {
                 .collect()
         };
         let before_the_first_step = working();
+        let is_refused = client.step(&listener, &[0.0], || ()).is_err();
+        // The server has finished with the refused step before it takes the next request.
+        client.restore(&listener, &words, || ()).unwrap();
+        let of_the_refused_step = working();
         for _ in 0..PROVEN_STEPS / u64::from(ENVS) {
             let taken = client.step(&listener, &vec![0.0; ENVS as usize], || ()).unwrap();
             assert!(matches!(taken, StepResult::Taken(_)));
@@ -152,6 +158,11 @@ mod tests {
         drop((client, heartbeats, listener, services));
         domain.leave().unwrap();
         assert_eq!(before_the_first_step, [0]);
+        assert!(is_refused, "one action is too few");
+        assert!(
+            of_the_refused_step.iter().all(|steps| *steps == 0),
+            "{of_the_refused_step:?}"
+        );
         assert!(of_steps.contains(&ENVS.into()), "{of_steps:?}");
         assert!(of_steps.contains(&PROVEN_STEPS), "{of_steps:?}");
     }

@@ -4,7 +4,7 @@
 mod snapshot;
 
 use shoal_base::space::{EnvironmentSpec, Space};
-use shoal_base::stream::{Purpose, Stream, stream};
+use shoal_base::stream::{self, Purpose, Stream};
 use shoal_channel::environment::StepBlocks;
 
 use crate::description::Description;
@@ -17,8 +17,8 @@ const EPISODE_BITS: u32 = 40;
 /// `count` environments of one kind, each in its own episode.
 ///
 /// All random numbers of training episode k of environment e come from stream (e, k) of `stream(seed, Environment,
-/// server, incarnation)`, all random numbers of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an
-/// episode does not depend on what was run before it.
+/// server, stream)`, all random numbers of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an episode
+/// does not depend on what was run before it.
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,
@@ -72,8 +72,8 @@ pub enum Reset<'a> {
 }
 
 impl VectorEnvironment {
-    /// Makes `count` (below 2²⁴) environments from `name` and `parameters`, for the server of this index.
-    /// `seed`, `server` and `stream` select the random streams of training episodes. `reset` must be called before the first `step`.
+    /// Makes `count` environments (below 2²⁴) from `name` and `parameters`. `seed`, `server` (the server's index) and
+    /// `stream` select the random streams of training episodes. Call `reset` before the first `step`.
     pub fn new(
         name: &str,
         parameters: &toml::Table,
@@ -92,11 +92,11 @@ impl VectorEnvironment {
     pub fn from_factory<E>(
         make: impl Fn() -> Result<Box<dyn Environment>, E>,
         count: u32,
-        (seed, server, number): (u64, u64, u64),
+        (seed, server, stream): (u64, u64, u64),
     ) -> Result<Self, E> {
         let scratch = make()?;
         let spec = scratch.spec();
-        let training = stream(seed, Purpose::Environment, server, number);
+        let training = stream::stream(seed, Purpose::Environment, server, stream);
         let running = |_| {
             let environment = make()?;
             Ok(Running {
@@ -268,7 +268,7 @@ impl VectorEnvironment {
                 return;
             }
             Some(Evaluation { seed, .. }) => {
-                running.rng = stream(seed, Purpose::Evaluation, running.next_evaluation, 0);
+                running.rng = stream::stream(seed, Purpose::Evaluation, running.next_evaluation, 0);
                 running.next_evaluation = running.next_evaluation.wrapping_add(stride);
             }
             None => {

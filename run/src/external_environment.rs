@@ -6,6 +6,7 @@ mod parameters;
 pub mod server_location;
 
 use std::cell::Cell;
+use std::num::NonZeroU32;
 use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -186,7 +187,7 @@ impl ExternalEnvironment {
             &self.listener,
             ResetRequest::Evaluation {
                 first: number,
-                episodes: 1,
+                episodes: NonZeroU32::MIN,
             },
             || self.give_up(asked),
         );

@@ -50,7 +50,7 @@ fn fill(run: &RunDir, configuration: &str, first_incarnation: u64, interrupt: In
         let launch_context = LaunchContext::of_run(run, &config)?;
         let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, launch_context, interrupt)?;
         let found = environment.spec();
-        if !found.matches(&config.spec) {
+        if found.difference(&config.spec).is_some() {
             bail!(
                 "the environment {} has other spaces on this host: {found:?} instead of {:?}",
                 config.environment.name,

@@ -237,8 +237,8 @@ impl Predecessor {
         let more = old
             .algorithm
             .settings()
-            .for_successor()
-            .or(new.algorithm.settings().for_successor());
+            .inherited_setting()
+            .or(new.algorithm.settings().inherited_setting());
         let more = more.map(|(key, _)| format!("{}.{key}", algorithms[0]));
         let of_shape = |it: &Difference| it.change == Change::Shape || Some(&it.key) == more.as_ref();
         let shapes = old.differences(new).into_iter().filter(of_shape);

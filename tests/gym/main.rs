@@ -30,6 +30,7 @@ fn main() -> ExitCode {
         test!(a_resumed_lockstep_run_begins_other_episodes, PYTHON),
         test!(termination_and_truncation_are_distinguished, PYTHON),
         test!(episodes_that_never_end_are_named, PYTHON),
+        test!(a_lockstep_run_begins_another_episode_after_an_invalid_answer, PYTHON),
         test!(discrete_spaces_with_an_offset_are_learned_by_a_table, PYTHON),
         test!(a_failing_environment_ends_the_run_with_its_last_output, PYTHON),
         test!(
@@ -181,10 +182,22 @@ fn episodes_that_never_end_are_named() {
         .concat();
         let message = error_line(&place.output(&arguments));
         assert!(
-            message.contains("environment.faults is 3") && message.contains("after 5 steps (environment 0)"),
+            message.contains("environment.faults is 3") && message.contains("environment 0 goes on after 5 steps"),
             "{message}"
         );
     }
+}
+
+fn a_lockstep_run_begins_another_episode_after_an_invalid_answer() {
+    let place = place();
+    let server = server_of("spoilt_server", "");
+    let few = ["--lockstep", "--steps", "400", "--set", "environment.faults=5"];
+    let arguments = [&SHORT[..], &few, &["--set", &server]].concat();
+    let running = place.start_in("run", &format!("{OURS}Ends-v0"), &arguments);
+    let incidents = running.run.join("incidents.csv");
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    let incidents = std::fs::read_to_string(incidents).unwrap();
+    assert!(incidents.contains(",fault,"), "{incidents}");
 }
 
 fn termination_and_truncation_are_distinguished() {

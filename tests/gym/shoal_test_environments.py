@@ -321,6 +321,23 @@ def endless_server():
     return main()
 
 
+def spoilt_server():
+    """An environment server whose rewards are no numbers in the first training episode of the first environment."""
+    from shoal_gym import environments
+
+    step = environments.Environments.step
+
+    def spoilt(self, actions, blocks):
+        step(self, actions, blocks)
+        if self._purpose is environments.Purpose.TRAINING and self._episode[0] == 0:
+            blocks.rewards[:] = np.nan
+
+    environments.Environments.step = spoilt
+    from shoal_gym.__main__ import main
+
+    return main()
+
+
 def holding_server(episodes):
     """An environment server that creates the file ``held`` and waits for the file ``go`` when it is first asked for other
     evaluation episodes than the first ``episodes``."""

@@ -109,7 +109,7 @@ fn open_temporary(path: &Path) -> io::Result<(PathBuf, File)> {
 
 /// Bytes of disk that the file at `path` occupies; 0 if there is none.
 pub fn allocated_bytes(path: &Path) -> u64 {
-    /// In which the system counts, whatever the file system's own blocks are.
+    /// The unit of `blocks()` in bytes, whatever the file system's block size.
     const BLOCK: u64 = 512;
     fs::metadata(path).map_or(0, |file| file.blocks() * BLOCK)
 }

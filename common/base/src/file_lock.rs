@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 /// Pause between two attempts to take a lock that another process holds.
 const RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
-/// The timeout for a lock that should be free. A process that only looks at a lock holds it for a moment, and one that
-/// was killed until the system has closed its files.
+/// How long to wait for a lock that should be free. A process that checks it holds it for a moment; a killed process
+/// holds it until the system has closed its files.
 pub const RELEASE_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Locks the file exclusively, waiting at most `timeout`. Returns whether it is locked now.
@@ -41,8 +41,8 @@ pub fn is_locked(file: &File) -> io::Result<bool> {
     }
 }
 
-/// The ids of the processes that hold a lock on the file with this metadata, as far as the system tells them. Some file
-/// systems show other inodes there.
+/// The ids of the processes that hold a lock on the file with this metadata, by `/proc/locks`. Empty on file systems
+/// for which that file shows other inodes.
 pub fn holders(file: &Metadata) -> Vec<i32> {
     let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
     locks.lines().filter_map(|line| holder(line, file.ino())).collect()

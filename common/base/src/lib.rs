@@ -1,5 +1,5 @@
-//! The vocabulary of all processes of Shoal: spaces, transitions, reports, random streams, and files that are either
-//! complete or absent.
+//! What every process of Shoal uses: spaces, transitions, roles and their reports, declared settings, random streams,
+//! and files that are either complete or absent.
 
 pub mod durable;
 pub mod exit;

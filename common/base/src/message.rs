@@ -3,7 +3,7 @@
 use std::fmt::Display;
 use std::io::Write;
 
-/// Writes a line to standard error. A terminal that is gone, as after `nohup`, must not make the work a failure.
+/// Writes a line to standard error. A failure is ignored: the work must not fail because its terminal was closed.
 pub fn say(line: impl Display) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -1,7 +1,7 @@
 //! Sums and checks of slices of numbers, and the limit of counters.
 
-/// No counter of a run reaches this number: rows, updates, episodes, versions, records, processes. Sums of numbers
-/// below it do not overflow.
+/// The upper limit of every counter of a run: rows, updates, episodes, versions, records, processes. Sums of a few
+/// counters below it fit into a `u64`.
 pub const COUNTER_LIMIT: u64 = 1 << 60;
 
 /// Mean and sample standard deviation; the latter is 0 for fewer than two numbers.
@@ -15,8 +15,8 @@ pub fn mean_and_std(numbers: &[f64]) -> (f64, f64) {
     (mean, (squares / (n - 1.0)).sqrt())
 }
 
-/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector
-/// instructions.
+/// Whether all these numbers are finite. It reads all of them even after one that is not: without an early exit, the
+/// compiler can use vector instructions.
 #[inline]
 pub fn are_finite(numbers: &[f32]) -> bool {
     numbers.iter().fold(true, |all, number| all & number.is_finite())

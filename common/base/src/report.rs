@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::role::{Activity, Role, RoleInstance};
 
-/// An environment server that has taken this many steps is able to work: it is restarted whenever it fails.
+/// After this many steps an environment server counts as able to work: it is then restarted whenever it fails.
 pub const PROVEN_STEPS: u64 = 1000;
 
 /// A sign of life of a role: sent when it is ready, when a lasting activity begins, and about twice a second.
@@ -64,6 +64,9 @@ impl Heartbeat {
         self.activity = activity as u32;
     }
 }
+
+/// The most environments of an actor.
+pub const MAX_ENVS: u32 = 4_096;
 
 /// An exploration episode has ended.
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]

@@ -60,7 +60,7 @@ pub struct RoleInstance {
     pub role: Role,
     /// Its index among the processes of that role.
     pub index: u32,
-    /// Grows with every process that the run starts, across all roles.
+    /// The number of this process among all that the run has started, of whatever role. It is never used twice.
     pub incarnation: u64,
 }
 

@@ -28,7 +28,7 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
         let only = Table::from_iter([(key.clone(), value.clone())]);
         let error = T::deserialize(only).err()?;
         let reason = in_user_words(error.message());
-        // In a list, an item is of another type.
+        // The value is a list, and one of its items has the wrong type.
         let each = value.is_array() && reason != error.message();
         let each = if each { "each " } else { "" };
         Some(Error::custom(refusal(
@@ -43,8 +43,8 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
     })
 }
 
-/// What a value must be, if this is serde's message about a value of another type, which names types of Rust. Otherwise
-/// the message itself, on one line.
+/// Rewords serde's message about a value of the wrong type, which names Rust types: the result says what the value must
+/// be. Other messages are returned unchanged, on one line.
 pub fn in_user_words(message: &str) -> String {
     let message = one_line(message);
     let of_type = message.starts_with("invalid type: ") || message.starts_with("invalid value: ");

@@ -3,7 +3,7 @@
 //! A role's standard input closes when the launcher asks it to end, and also when the launcher dies, because the system
 //! closes the pipe. If the role is still there some time later, stuck in a call that does not return, the thread that
 //! watches standard input kills it. A line on standard input asks the role to retire: the run continues without it, and
-//! it may take the time to hand over everything it has.
+//! it may take as long as it needs to hand over what it has.
 
 use std::io::{ErrorKind, Read};
 use std::sync::Arc;
@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use rustix::process::{Signal, getpgrp, getpid, kill_process, kill_process_group};
 
-/// How long a role may take to end after its standard input has closed. After that it ends itself at once. The
-/// launcher has limits of its own, which are not longer.
+/// How long a role may take to end after its standard input has closed. After that, a thread of its own kills it. The
+/// limits of a living launcher are not longer.
 pub const GRACE: Duration = Duration::from_secs(15);
 
 const RETIRE: u8 = 1;

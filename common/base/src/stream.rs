@@ -1,5 +1,5 @@
-//! Random streams. Every random number of a run comes from one of them. A stream is named by its purpose, index and
-//! incarnation, so no two processes share numbers, and a counter leads back to any point of it.
+//! Random streams. Every random number of a run comes from one of them. A stream is named by seed, purpose, index and
+//! incarnation, and a counter selects any position in it.
 
 use rand::SeedableRng;
 pub use rand_chacha::ChaCha8Rng as Stream;

@@ -34,8 +34,8 @@ pub struct Transition<'a> {
     pub discount: f32,
     /// Observation `s'` after the step.
     pub s_next: &'a [f32],
-    /// Whether the episode ended with this step, terminated or truncated. In a row of several steps: with the first
-    /// of them.
+    /// Whether the episode ended with this step, terminated or truncated. In a row of several steps, whether it ended
+    /// with the first of them.
     pub last: bool,
 }
 
@@ -60,8 +60,8 @@ impl RowLayout {
         2 * self.observation + self.action + 3
     }
 
-    /// Words (`u64`) of the rows that an actor with `envs` environments has not put into a chunk yet, if a transition
-    /// has `n` steps: the counts of rows, and at most `n` rows for each environment. 0 if `n` is 1.
+    /// Words (`u64`) that an actor's snapshot has for rows that are not in a chunk yet, with `envs` environments and
+    /// transitions of `n` steps: the counts of such rows, then space for `n` rows of each environment. 0 if `n` is 1.
     pub fn n_step_words(&self, n: usize, envs: usize) -> usize {
         match n {
             1 => 0,
@@ -100,13 +100,13 @@ impl RowLayout {
 
 impl ChunkLayout {
     /// Numbers in the rows.
-    pub fn numbers_of_rows(&self) -> usize {
+    pub fn rows_len(&self) -> usize {
         self.rows * self.row.width()
     }
 
     /// Numbers in a chunk.
     pub fn len(&self) -> usize {
-        self.numbers_of_rows() + NUMBERS_PER_WORD * self.actor_snapshot_words
+        self.rows_len() + NUMBERS_PER_WORD * self.actor_snapshot_words
     }
 
     /// Whether a chunk holds nothing.

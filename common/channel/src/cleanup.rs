@@ -24,14 +24,14 @@ use rustix::process::{Pid, test_kill_process};
 use super::domain::{Domain, DomainError, io_error, iox_config, user_root};
 use super::error::ChannelError;
 use super::files::{SHARED_MEMORY, files_of};
+use super::membership::is_members_file;
 use super::memory::is_reservation;
-use super::presence::is_presence;
 
 /// Interval between two sweeps: the longest time that an unfinished file of a dead process delays other processes.
 const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
 
-/// The least age of a file that is removed. Its maker may still be creating it, which takes some microseconds, even if
-/// no process seems to have it open.
+/// The least age of a file that is removed. A younger one may still be in creation, which takes some microseconds,
+/// although no process seems to have it open.
 const MIN_AGE: Duration = Duration::from_millis(50);
 
 /// How long a clean-up waits for unfinished files whose makers may be alive.
@@ -66,7 +66,7 @@ impl Sweeper {
         let thread = std::thread::Builder::new()
             .name("sweeper".into())
             .spawn(sweep)
-            .map_err(|cause| ChannelError::new("all", "start the sweeper thread", cause))?;
+            .map_err(|cause| ChannelError::new("of the run", "start the sweeper thread", cause))?;
         Ok(Self {
             stop: Some(stop),
             thread: Some(thread),
@@ -110,7 +110,7 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
 /// Whether iceoryx2 has not finished the file: it has no size, or is not readable.
 fn is_unfinished(path: &Path, metadata: &Metadata) -> bool {
     let name = path.file_name().map(|name| name.to_string_lossy());
-    let is_ours = name.is_some_and(|name| is_reservation(&name) || is_presence(&name));
+    let is_ours = name.is_some_and(|name| is_reservation(&name) || is_members_file(&name));
     metadata.is_file() && !is_ours && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
 }
 
@@ -141,7 +141,8 @@ impl Domain {
     /// When files cannot be listed or removed.
     pub fn clean_up(run_id: &str) -> Result<u32, DomainError> {
         let root = user_root()?;
-        let config = iox_config(&root, run_id).map_err(|cause| DomainError::Join {
+        let config = iox_config(&root, run_id).map_err(|cause| DomainError::SharedMemory {
+            action: "clean up after",
             run_id: run_id.into(),
             cause,
         })?;
@@ -200,7 +201,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::super::files::prefix;
-    use super::super::presence::Presence;
+    use super::super::membership::Membership;
     use super::*;
 
     /// A file of this test's own run, removed on drop.
@@ -230,19 +231,19 @@ mod tests {
     fn only_unfinished_files_of_dead_processes_are_removed() {
         // Without a member of their run, another run that starts now would remove these files.
         let (members, _) = Leftover::new("members", 0o600, b"");
-        let _presence = Presence::enter(&run_id()).unwrap();
+        let _membership = Membership::enter(&run_id()).unwrap();
         let ((empty, making), (closed, filling)) = (
             Leftover::new("1_2.connection", 0o200, b""),
             Leftover::new("1_3.connection", 0o200, b"half"),
         );
         let (whole, _) = Leftover::new("1.data", 0o600, b"whole");
-        let (promise, _) = Leftover::new("promise_4096", 0o600, b"");
+        let (reserved, _) = Leftover::new("reserved_4096", 0o600, b"");
         std::thread::sleep(2 * MIN_AGE);
         assert!(!remove_unfinished(&run_id()).unwrap());
         assert!(empty.0.exists() && closed.0.exists(), "their maker is alive");
         drop((making, filling));
         assert!(remove_unfinished(&run_id()).unwrap());
         assert!(!empty.0.exists() && !closed.0.exists());
-        assert!(whole.0.exists() && promise.0.exists() && members.0.exists());
+        assert!(whole.0.exists() && reserved.0.exists() && members.0.exists());
     }
 }

@@ -11,7 +11,6 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
     RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
 };
-use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
 use self::message::{AddressedRequest, VERSION, decode, encode};
@@ -19,7 +18,7 @@ pub use self::message::{
     ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, JoinAgain, RoleState, RoleStatus,
     RunDirId, RunStatus, ScaleRequest,
 };
-use super::domain::Domain;
+use super::domain::{Domain, DomainError};
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::event::{Listener, Notifier};
 use super::memory;
@@ -53,7 +52,7 @@ const RESPONSE_BYTES_PER_HOST: usize = 192;
 /// idle.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// How long a request about the status waits for a launcher without a service.
+/// How long a status request waits for the service of a launcher that is starting or ending.
 const MISSING_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How often the client checks that the launcher is still alive.
@@ -83,6 +82,9 @@ pub enum ControlError {
     /// The channel does not work.
     #[error(transparent)]
     Channel(#[from] ChannelError),
+    /// The run's lock cannot be taken, so no ports can be made.
+    #[error(transparent)]
+    Domain(DomainError),
     /// The launcher lives and has no service for requests: it is starting, or the roles have ended already.
     #[error("the run is starting, or ending; try again")]
     Missing,
@@ -127,15 +129,15 @@ impl ControlPort {
         })
     }
 
-    /// Answers all requests about `run`, which is in the directory `place`, that have arrived since the last call. If
-    /// `answer` returns `None`, the client waits for [`answer_waiting`](Self::answer_waiting).
+    /// Answers all requests about `run`, which is in `directory`, that have arrived since the last call. If `answer`
+    /// returns `None`, the client waits for [`answer_waiting`](Self::answer_waiting).
     ///
     /// # Errors
     /// When the channel does not work, or `answer` fails.
     pub fn answer_requests<E: From<ChannelError>>(
         &mut self,
         run: RunDirId,
-        place: &Path,
+        directory: &Path,
         mut answer: impl FnMut(ControlRequest) -> Result<Option<ControlResponse>, E>,
     ) -> Result<(), E> {
         // Clear the notifications before reading the requests: a later request notifies again.
@@ -148,7 +150,7 @@ impl ControlPort {
             let Some(request) = received else { return Ok(()) };
             let answer = match decode(request.user_header().version, request.payload()) {
                 Ok(AddressedRequest { run: addressed, .. }) if addressed != run => {
-                    Some(ControlResponse::AnotherRun(place.display().to_string()))
+                    Some(ControlResponse::AnotherRun(directory.display().to_string()))
                 }
                 Ok(AddressedRequest { request, .. }) => answer(request)?,
                 Err(reason) => Some(ControlResponse::Refused(format!(
@@ -220,12 +222,13 @@ pub fn ask(
     };
     // A launcher that is starting has not created the service yet, and one that is ending has removed it.
     let ports = loop {
-        let Some(made) = domain.make_ports(make_ports) else {
-            return Err(if is_alive() {
-                ControlError::Removed
-            } else {
-                ControlError::Gone
-            });
+        let made = match domain.make_ports(make_ports) {
+            Ok(Some(made)) => made,
+            Ok(None) if is_alive() => return Err(ControlError::Removed),
+            // The run's processes take this lock when they join and leave, for seconds where the disk is busy.
+            Err(DomainError::Locked(_)) if is_alive() && Instant::now() < deadline => continue,
+            Err(error) if is_alive() => return Err(ControlError::Domain(error)),
+            Ok(None) | Err(_) => return Err(ControlError::Gone),
         };
         match made {
             Ok(ports) => break ports,
@@ -327,12 +330,7 @@ fn response_length(max_actors: usize) -> usize {
 
 /// Creates the service.
 pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
-    let service = service(domain, OpenMode::Create)?;
-    Ok(HeldService::new(move |visit| {
-        let ports = service.dynamic_config();
-        ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
-        ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
-    }))
+    service(domain, OpenMode::Create).map(HeldService::of_request_response)
 }
 
 type ControlClient = Client<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
@@ -363,7 +361,7 @@ mod tests {
     use crate::Services;
 
     #[test]
-    fn a_question_wakes_the_launcher() {
+    fn a_request_wakes_the_launcher() {
         let run_id = format!("a{:x}", std::process::id());
         let domain = Domain::join(&run_id, 1).unwrap();
         let mut services = Services::new(&domain).unwrap();
@@ -397,6 +395,24 @@ mod tests {
             );
         });
         drop((port, services));
+        domain.leave().unwrap();
+    }
+
+    #[test]
+    fn a_busy_lock_is_not_taken_for_new_shared_memory() {
+        let run_id = format!("l{:x}", std::process::id());
+        let domain = Domain::join(&run_id, 1).unwrap();
+        let visitor = Domain::visit(&run_id, 1).unwrap();
+        let held = std::fs::File::open(domain.directory().unwrap()).unwrap();
+        held.lock().unwrap();
+        let run = RunDirId { device: 1, inode: 2 };
+        let answer = ask(&visitor, run, ControlRequest::Stop, Duration::ZERO, || true);
+        drop(held);
+        assert!(
+            matches!(answer, Err(ControlError::Domain(DomainError::Locked(_)))),
+            "{answer:?}"
+        );
+        visitor.leave().unwrap();
         domain.leave().unwrap();
     }
 

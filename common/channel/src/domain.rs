@@ -15,24 +15,40 @@ use iceoryx2::prelude::{
 use shoal_base::file_lock;
 
 use super::files::{SHARED_MEMORY, files_of, prefix};
+use super::membership::{self, Claim, Membership};
 use super::memory;
-use super::presence::{self, Claim, Presence};
 
 /// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How long a visitor waits for it before it does without.
+/// How long a visitor waits for a run's lock. Without it, it makes no ports and does not drop those it has.
 const VISITOR_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The node name of processes that join a run only to ask its launcher something.
-const VISITOR: &str = "visitor";
+/// How a process takes part in a run.
+#[derive(Clone, Copy, Debug)]
+enum Participant {
+    /// A process of the run.
+    Member,
+    /// A process that only asks the run's launcher something.
+    Visitor,
+}
 
-/// The membership of a process in a run. All its channels are opened through it.
+impl Participant {
+    /// The name of its node.
+    fn node_name(self) -> &'static str {
+        match self {
+            Self::Member => "",
+            Self::Visitor => "visitor",
+        }
+    }
+}
+
+/// A process's access to a run in shared memory. All its channels are opened through it.
 #[derive(Debug)]
 pub struct Domain {
     node: Node<ipc::Service>,
     /// `None` for visitors.
-    presence: Option<Presence>,
+    membership: Option<Membership>,
     /// The user's directory, with a shared lock: systemd does not tidy up a locked directory.
     _user_root: Option<File>,
     /// The run's directory in it, as it was when this process joined.
@@ -73,8 +89,10 @@ pub enum DomainError {
         pids: Vec<i32>,
     },
     /// iceoryx2 refused.
-    #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
-    Join {
+    #[error("cannot {action} run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
+    SharedMemory {
+        /// What was tried, as a verb.
+        action: &'static str,
         /// The id of the run.
         run_id: String,
         /// iceoryx2's reason.
@@ -88,7 +106,7 @@ impl Domain {
     /// # Errors
     /// When the user's directory cannot be created, or shared memory is unavailable.
     pub fn join(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
-        Self::enter(run_id, max_actors, "")
+        Self::enter(run_id, max_actors, Participant::Member)
     }
 
     /// Joins the run as a visitor, which only asks its launcher something. The run does not wait for visitors to end.
@@ -96,24 +114,28 @@ impl Domain {
     /// # Errors
     /// As [`join`](Self::join).
     pub fn visit(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
-        Self::enter(run_id, max_actors, VISITOR)
+        Self::enter(run_id, max_actors, Participant::Visitor)
     }
 
-    fn enter(run_id: &str, max_actors: u32, name: &str) -> Result<Self, DomainError> {
+    fn enter(run_id: &str, max_actors: u32, participant: Participant) -> Result<Self, DomainError> {
         let root = user_root()?;
+        let directory = root.join(run_id);
         // Held until the node exists, so that a process that removes abandoned runs does not remove this one.
-        let lock = make_and_lock(&root.join(run_id))?;
+        let lock = make_and_lock(&directory)?;
         let user_root = File::open(&root).map_err(io_error("open", &root))?;
-        let presence = match name {
-            VISITOR => None,
-            _ => Some(Presence::enter(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))?),
+        let membership = match participant {
+            Participant::Visitor => None,
+            Participant::Member => {
+                Some(Membership::enter(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))?)
+            }
         };
-        let failed = |cause: String| DomainError::Join {
+        let failed = |cause: String| DomainError::SharedMemory {
+            action: "join",
             run_id: run_id.into(),
             cause,
         };
         let config = iox_config(&root, run_id).map_err(failed)?;
-        let name = NodeName::new(name).map_err(|cause| failed(format!("{cause:?}")))?;
+        let name = NodeName::new(participant.node_name()).map_err(|cause| failed(format!("{cause:?}")))?;
         let node = NodeBuilder::new()
             .name(&name)
             .config(&config)
@@ -121,10 +143,10 @@ impl Domain {
             .create::<ipc::Service>()
             .map_err(|cause| failed(format!("{cause:?}")))?;
         close_to_others(run_id)?;
-        let root = lock.metadata().map_err(io_error("inspect", &root))?;
+        let root = lock.metadata().map_err(io_error("inspect", &directory))?;
         Ok(Self {
             node,
-            presence,
+            membership,
             // Only the program that tidies up holds an exclusive lock, for a moment.
             _user_root: user_root.try_lock_shared().is_ok().then_some(user_root),
             root: (root.dev(), root.ino()),
@@ -211,33 +233,39 @@ impl Domain {
         self.is_intact(0)
     }
 
-    /// Calls `make`, which makes ports of a visitor, unless the shared memory that it has joined was removed: services
-    /// have the same names when the run has begun again, and there nobody could free these ports after this process's
-    /// death. Returns `None` then, or if the run's lock cannot be had.
-    pub(super) fn make_ports<Ports>(&self, make: impl FnOnce() -> Ports) -> Option<Ports> {
+    /// Makes ports of a visitor by calling `make`, under the run's lock. Returns `None` if the shared memory that this
+    /// process joined was removed: the run may have begun again with services of the same names, and nobody would free
+    /// the ports there after this process's death.
+    ///
+    /// # Errors
+    /// When another process holds the lock for too long, or the lock cannot be used.
+    pub(super) fn make_ports<Ports>(&self, make: impl FnOnce() -> Ports) -> Result<Option<Ports>, DomainError> {
         // Files are removed only under this lock.
-        let _lock = self.lock_as_visitor()?;
-        self.is_current().then(make)
+        let Some(_lock) = self.lock_as_visitor()? else {
+            return Ok(None);
+        };
+        Ok(self.is_current().then(make))
     }
 
     /// Drops the ports of a visitor. With the last port of a service, iceoryx2 removes the service's files by their
     /// names, which are the same when the run has begun again. So ports of shared memory that was removed are leaked.
     pub(super) fn drop_ports<Ports>(&self, ports: Ports) {
         let lock = self.lock_as_visitor();
-        if lock.is_some() && self.is_current() {
+        if matches!(lock, Ok(Some(_))) && self.is_current() {
             drop(ports);
         } else {
             std::mem::forget(ports);
         }
     }
 
-    fn lock_as_visitor(&self) -> Option<File> {
-        lock_within(&self.directory().ok()?, VISITOR_LOCK_TIMEOUT).ok()?
+    /// Takes the run's lock; `None` if there is no such run.
+    fn lock_as_visitor(&self) -> Result<Option<File>, DomainError> {
+        lock_within(&self.directory()?, VISITOR_LOCK_TIMEOUT)
     }
 
     /// Whether a process of the run is alive, even if iceoryx2 does not find it. Visitors are not counted.
     pub fn has_members(&self) -> bool {
-        matches!(presence::claim(&self.run_id), Ok(Claim::Held))
+        matches!(membership::claim(&self.run_id), Ok(Claim::Held))
     }
 
     /// Leaves the run. The last process to leave removes all files of the run from shared memory, even if the launcher
@@ -247,11 +275,14 @@ impl Domain {
     /// When files cannot be removed.
     pub fn leave(self) -> Result<(), DomainError> {
         let Self {
-            node, presence, run_id, ..
+            node,
+            membership,
+            run_id,
+            ..
         } = self;
         drop(node);
-        if let Some(presence) = presence {
-            presence.leave();
+        if let Some(membership) = membership {
+            membership.leave();
         }
         let root = user_root()?;
         // It is created again if it is gone: another program may have removed it, but not the files in shared memory.
@@ -278,7 +309,7 @@ impl Domain {
             }
             if Instant::now() >= deadline {
                 if left.is_empty() {
-                    left = presence::members(run_id);
+                    left = membership::members(run_id);
                 }
                 return Err(DomainError::StillAlive {
                     run_id: run_id.into(),
@@ -290,7 +321,7 @@ impl Domain {
     }
 
     /// Removes the files of this user's runs that no longer have a living process. What cannot be inspected or removed
-    /// for the moment is left to the next call: it is no fault of the run that is about to start.
+    /// for the moment is left to the next call: it is not an error of the run that is about to start.
     ///
     /// # Errors
     /// When the user's directory or `/dev/shm` cannot be read.
@@ -303,7 +334,7 @@ impl Domain {
             }
         }
         // Runs whose directory another program has removed.
-        let runs = presence::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
+        let runs = membership::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
         for run_id in runs.iter().filter(|run_id| !root.join(run_id).exists()) {
             leave_to_the_next(run_id, remove_without_directory(&root, run_id));
         }
@@ -338,7 +369,7 @@ fn is_missing(error: &io::Error) -> bool {
 }
 
 fn claim(run_id: &str) -> Result<Claim, DomainError> {
-    presence::claim(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))
+    membership::claim(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))
 }
 
 /// Makes the file that counts the run's nodes private: iceoryx2 makes it accessible to everybody, whatever the umask.
@@ -368,7 +399,8 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
 
 /// Process ids of the living processes of the run, including stopped ones but not visitors.
 fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
-    let failed = |cause: String| DomainError::Join {
+    let failed = |cause: String| DomainError::SharedMemory {
+        action: "list the processes of",
         run_id: run_id.into(),
         cause,
     };
@@ -380,7 +412,7 @@ fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> 
             NodeState::Dead(_) => false,
             NodeState::Alive(node) => {
                 let name = node.details().as_ref().map(|details| details.name().as_str());
-                name != Some(VISITOR)
+                name != Some(Participant::Visitor.node_name())
             }
             // For example, a process that was killed while it joined.
             NodeState::Inaccessible(_) | NodeState::Undefined(_) => {

@@ -94,8 +94,8 @@ pub enum ChannelErrorKind {
     /// The service exists, but is damaged.
     #[error("it is damaged; stop the run and resume it")]
     Corrupted,
-    /// Memory, files, or the samples that may be held at the same time are used up.
-    #[error("memory or files are used up; is /dev/shm full?")]
+    /// Memory, files, threads, or the samples that may be held at the same time are used up.
+    #[error("memory, files or threads are used up; is /dev/shm full, or a limit of `ulimit -a` reached?")]
     Exhausted,
     /// The other side exists, but its memory cannot be used.
     #[error("no connection to the other side")]

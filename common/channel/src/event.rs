@@ -23,13 +23,13 @@ use super::error::{Cause, ChannelError};
 use super::service::{HeldService, OpenMode, make_port, service_name};
 use super::{descriptor, memory};
 
-/// Polls before a waiting process blocks. A peer on another core usually answers during the polls. On a shared core
-/// they cost it some microseconds.
+/// Polls before a waiting process blocks. A peer on another core usually answers during the polls. If both are on one
+/// core, the polls delay the peer by some microseconds.
 const POLLS: u32 = 200;
 
-/// After this many waits in a row without success from polling, a process blocks at once: a peer on the same core gets
-/// that core, and no core is busy waiting for a peer that always takes longer. With a smaller number, a process would
-/// too often stop polling for a peer that answers in time only now and then.
+/// After this many waits in a row in which polling was in vain, a process blocks at once. A peer on the same core then
+/// gets the core, and no core polls for a peer that always takes longer. With a smaller number, polling would stop too
+/// often for a peer that is fast only now and then.
 const MAX_MISSES: u32 = 64;
 
 /// After that, one in this many waits polls again, because processes move from core to core.
@@ -178,8 +178,8 @@ impl Notifier {
         make_port(|| Self::on(domain, &channel))
     }
 
-    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the request when
-    /// it next looks by itself.
+    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the request when it
+    /// next checks for requests.
     pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
         Self::on(domain, LAUNCHER).ok()
     }

@@ -33,8 +33,8 @@ impl HeartbeatSender {
         })
     }
 
-    /// Reports that the first step of the work begins, which the process may not survive. So the launcher distinguishes
-    /// a role that dies in its first step from a role that was waiting.
+    /// Reports at once that the first step begins. If the process dies in that step, the launcher knows that it was
+    /// working and not waiting.
     pub fn begin_work(&mut self) {
         if self.heartbeat.steps == 0 {
             self.beat_now(Activity::Working);

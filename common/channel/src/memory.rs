@@ -22,11 +22,11 @@ const CHUNK_INDEX: usize = 4;
 const CONNECTION: usize = 512;
 const CHANNEL: usize = 256;
 const SERVICE: usize = 768;
-const PARTY: usize = 96;
+const PARTICIPANT: usize = 96;
 
 /// An empty file records how much memory is reserved to a run. Its name is the run's prefix, this word, and the number
 /// of bytes. (The length of a file may be limited, so it is not used.)
-const RESERVATION: &str = "promise_";
+const RESERVATION: &str = "reserved_";
 
 /// Whether a file of this name records a reservation.
 pub(super) fn is_reservation(name: &str) -> bool {
@@ -48,7 +48,7 @@ pub(super) fn connection(channels: usize, buffer: usize, borrowed: usize, chunks
 
 /// Bytes of a service's list of ports and processes.
 pub(super) fn service(participants: usize) -> u64 {
-    pages(SERVICE + PARTY * participants)
+    pages(SERVICE + PARTICIPANT * participants)
 }
 
 /// The number of bytes, rounded up to whole pages.

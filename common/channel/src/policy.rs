@@ -37,7 +37,6 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::service::header::publish_subscribe::Header;
-use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::domain::Domain;
@@ -216,12 +215,7 @@ fn samples(max_actors: usize) -> usize {
 
 /// Creates the service.
 pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
-    let service = service(domain, OpenMode::Create)?;
-    Ok(HeldService::new(move |visit| {
-        let ports = service.dynamic_config();
-        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
-    }))
+    service(domain, OpenMode::Create).map(HeldService::of_publish_subscribe)
 }
 
 fn service(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {

@@ -7,9 +7,8 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
-use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport, MAX_ENVS};
 
 use super::domain::{Domain, participants};
 use super::error::ChannelError;
@@ -42,8 +41,8 @@ pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     fn receiver(domain: &Domain) -> Result<Box<dyn Receiver<Self>>, ChannelError>;
 }
 
-/// Declares a kind of report. Its ports are compiled once, here, and not again in each crate that uses them: that saves
-/// half a megabyte of iceoryx2 code for each.
+/// Declares a kind of report. Its ports are compiled in this crate alone. Compiled again in each crate that uses them,
+/// they would take another half a megabyte each.
 macro_rules! report {
     ($report:ty: $($constants:tt)*) => {
         impl Report for $report {
@@ -68,8 +67,8 @@ report! { Heartbeat:
 
 report! { EpisodeReport:
     const CHANNEL: &'static str = "reports/episodes";
-    // The most environments that an actor can have: a time limit ends all their episodes at the same step.
-    const BUFFER: usize = 4096;
+    // A time limit ends the episodes of all environments of an actor at the same step.
+    const BUFFER: usize = MAX_ENVS as usize;
     const HISTORY: usize = 0;
     // The launcher alone: each further reader would cost every actor 370 KB.
     const READERS: usize = 1;
@@ -206,12 +205,7 @@ pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
 
 /// Creates the service of reports of kind `R`.
 pub(super) fn create<R: Report>(domain: &Domain) -> Result<HeldService, ChannelError> {
-    let service = service::<R>(domain, OpenMode::Create)?;
-    Ok(HeldService::new(move |visit| {
-        let ports = service.dynamic_config();
-        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
-    }))
+    service::<R>(domain, OpenMode::Create).map(HeldService::of_publish_subscribe)
 }
 
 fn service<R: Report>(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {

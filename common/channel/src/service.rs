@@ -4,7 +4,8 @@ use std::fmt;
 use std::time::{Duration, Instant};
 
 use iceoryx2::identifiers::UniqueNodeId;
-use iceoryx2::prelude::{CallbackProgression, ServiceName};
+use iceoryx2::prelude::{CallbackProgression, IceoryxSend, ServiceName, ZeroCopySend, ipc};
+use iceoryx2::service::port_factory::{PortFactory as _, publish_subscribe, request_response};
 
 use super::domain::Domain;
 use super::error::{Cause, ChannelError};
@@ -38,7 +39,7 @@ impl OpenMode {
 /// The name of a channel's service, for the processes of the run and for iceoryx2's tools.
 pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName, ChannelError> {
     let name = format!("shoal/{}/{channel}", domain.run_id());
-    ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "make the service name", cause))
+    ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "name the service", cause))
 }
 
 /// How long to wait for a port that another process occupies, usually a dead predecessor.
@@ -75,6 +76,33 @@ impl HeldService {
         }
     }
 
+    /// Keeps a publish-subscribe service open.
+    pub(super) fn of_publish_subscribe<P, H>(service: publish_subscribe::PortFactory<ipc::Service, P, H>) -> Self
+    where
+        P: fmt::Debug + IceoryxSend + ?Sized + 'static,
+        H: fmt::Debug + ZeroCopySend + 'static,
+    {
+        Self::new(move |visit| {
+            let ports = service.dynamic_config();
+            ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
+            ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
+        })
+    }
+
+    /// Keeps a request-response service open whose requests and responses have payloads of one type.
+    pub(super) fn of_request_response<P, Q, R>(service: request_response::PortFactory<ipc::Service, P, Q, P, R>) -> Self
+    where
+        P: fmt::Debug + IceoryxSend + ?Sized + 'static,
+        Q: fmt::Debug + ZeroCopySend + 'static,
+        R: fmt::Debug + ZeroCopySend + 'static,
+    {
+        Self::new(move |visit| {
+            let ports = service.dynamic_config();
+            ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
+            ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
+        })
+    }
+
     /// Visits every port of the service.
     pub(super) fn list_ports(&self, visit: VisitPort<'_>) {
         (self.list_ports)(visit);
@@ -93,7 +121,6 @@ mod tests {
     use std::path::PathBuf;
 
     use iceoryx2::port::publisher::Publisher;
-    use iceoryx2::prelude::{ZeroCopySend, ipc};
     use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
     use super::super::error::{ChannelErrorKind, PeerError};

@@ -1,7 +1,8 @@
 //! Transitions, from one actor to the learner, in chunks of rows.
 //!
-//! Most actors have a service of their own. Those of joined hosts beyond the first few hundred share one: there, the
-//! gate sends the chunks of all of them, and the learner commits them in the same order.
+//! An actor has a service of its own, unless its index is `ActorsConfig::MAX_ON_A_HOST` or more. Those actors, all on
+//! joined hosts, share one service: the gate sends the chunks of all of them, and the learner commits them in that
+//! order.
 //!
 //! An actor has at most `window` chunks sent but not committed. The service's history holds as many, and the learner's
 //! buffer twice as many, because a new learner may receive a whole history that was committed before and a whole window
@@ -74,8 +75,8 @@ pub struct ChunkSender {
 #[derive(Debug)]
 pub struct Handshake(ChunkSender);
 
-/// The end of the process that forwards what an actor of another host has sent. It is to the learner what the actor
-/// would be: its headers are the actor's own, and its history is the actor's.
+/// The end of the process that forwards what an actor of another host has sent. The learner cannot tell it from the
+/// actor: the chunks keep the actor's headers, and the history holds the actor's chunks.
 #[derive(Debug)]
 pub struct ChunkForwarder {
     publisher: Publisher<ipc::Service, [f32], ChunkHeader>,
@@ -287,7 +288,7 @@ impl ChunkForwarder {
     /// are not those of such a chunk: a handshake has neither rows nor a snapshot.
     pub fn parts<'a>(&self, header: &ChunkHeader, numbers: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
         let rows = header.rows as usize;
-        let snapshot = self.layout.len() - self.layout.numbers_of_rows();
+        let snapshot = self.layout.len() - self.layout.rows_len();
         let (most_rows, snapshot) = match header.sequence {
             0 => (0, 0),
             _ => (self.layout.rows, snapshot),
@@ -315,7 +316,7 @@ impl ChunkForwarder {
             .map_err(|cause| ChannelError::new(&self.channel, "begin a chunk", cause))?;
         *sample.user_header_mut() = header;
         sample.payload_mut()[..rows.len()].copy_from_slice(rows);
-        let end = self.layout.numbers_of_rows();
+        let end = self.layout.rows_len();
         sample.payload_mut()[end..][..snapshot.len()].copy_from_slice(snapshot);
         sample.send().map(drop).map_err(failed)
     }
@@ -334,7 +335,7 @@ impl ChunkForwarder {
 impl Chunk {
     /// Writes the next row. A full chunk ignores it.
     pub fn push(&mut self, transition: &Transition<'_>) {
-        let rows = self.layout.numbers_of_rows();
+        let rows = self.layout.rows_len();
         let mut rows = self.sample.payload_mut()[..rows].chunks_exact_mut(self.layout.row.width());
         if let Some(row) = rows.nth(self.filled) {
             self.layout.row.write(transition, row);
@@ -347,7 +348,7 @@ impl Chunk {
     /// # Panics
     /// If there are not exactly as many words as the layout requires.
     pub fn set_actor_snapshot(&mut self, words: &[u64]) {
-        let rows = self.layout.numbers_of_rows();
+        let rows = self.layout.rows_len();
         self.sample.payload_mut()[rows..].copy_from_slice(numbers_of(words));
     }
 
@@ -460,13 +461,13 @@ impl ReceivedChunk {
     /// Its rows, and the numbers of the actor's snapshot after them; no numbers for a handshake, and if the layout has
     /// no snapshots.
     pub fn parts(&self) -> (&[f32], &[f32]) {
-        let snapshot = &self.sample.payload()[self.layout.numbers_of_rows()..];
+        let snapshot = &self.sample.payload()[self.layout.rows_len()..];
         (self.rows(), if self.is_handshake() { &[] } else { snapshot })
     }
 
     /// The actor's snapshot after it; `None` for a handshake, and if the layout has no snapshots.
     pub fn actor_snapshot(&self) -> Option<Vec<u64>> {
-        let rows = self.layout.numbers_of_rows();
+        let rows = self.layout.rows_len();
         let present = self.layout.actor_snapshot_words > 0 && !self.is_handshake();
         present.then(|| words_of(&self.sample.payload()[rows..]))
     }
@@ -503,12 +504,7 @@ pub(super) fn create_shared(domain: &Domain, actors: u32, window: u32) -> Result
 }
 
 fn create_channel(domain: &Domain, channel: &str, window: u32) -> Result<HeldService, ChannelError> {
-    let service = service(domain, channel, window, OpenMode::Create)?;
-    Ok(HeldService::new(move |visit| {
-        let ports = service.dynamic_config();
-        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
-    }))
+    service(domain, channel, window, OpenMode::Create).map(HeldService::of_publish_subscribe)
 }
 
 fn publisher(

@@ -50,8 +50,8 @@ pub trait AlgorithmSettings {
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;
 
-    /// A key, beside the shapes, that a run takes over if it begins with networks of these settings, and its value.
-    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+    /// A key and its value that a run takes over, besides the shapes, when it begins with networks of these settings.
+    fn inherited_setting(&self) -> Option<(&'static str, toml::Value)> {
         None
     }
 

@@ -32,7 +32,7 @@ section! {
         learning_rate: f64 = 5e-4, bounds: above(0.0, 1.0), unit: "–", source: "ours", change: Change::Learning;
         /// N, transitions in a minibatch.
         batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "ours", change: Change::Learning;
-        /// The target network becomes a copy of the network after every so many updates.
+        /// Updates from one copy of the network into the target network to the next.
         target_every: u64 = 1_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours",
             change: Change::Learning;
         /// Whether the action in s' is chosen by the network and valued by the target network. Otherwise the target
@@ -50,9 +50,10 @@ section! {
         /// ε at the end.
         epsilon_end: f64 = 0.05, bounds: from(0.0, 1.0), unit: "share of the steps", source: "ours",
             change: EXPLORATION;
-        /// Environment steps of all actors in which ε falls linearly from the first to the second value. 0 becomes a
-        /// tenth of `run.steps` when the run is created.
-        epsilon_steps: u64 = 0, unit: "environment steps", source: "ours", change: EXPLORATION;
+        /// Environment steps of all actors in which ε falls linearly from `epsilon_start` to `epsilon_end`. If it is 0
+        /// when the run is created, the program sets it to a tenth of `run.steps`.
+        epsilon_steps: u64 = 0, bounds: from(0, 1_000_000_000_000), unit: "environment steps", source: "ours",
+            change: EXPLORATION;
     }
 }
 
@@ -89,7 +90,7 @@ impl AlgorithmSettings for DqnConfig {
     }
 
     /// The successor explores as this run did in the end.
-    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+    fn inherited_setting(&self) -> Option<(&'static str, toml::Value)> {
         Some(("epsilon_start", self.epsilon_end.into()))
     }
 

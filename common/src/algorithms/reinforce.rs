@@ -102,8 +102,8 @@ impl AlgorithmSettings for ReinforceConfig {
         1
     }
 
-    /// Only with a baseline there is a second network.
-    fn for_successor(&self) -> Option<(&'static str, toml::Value)> {
+    /// Only with a baseline is there a second network.
+    fn inherited_setting(&self) -> Option<(&'static str, toml::Value)> {
         (self.weight == ReturnWeighting::Baseline).then(|| ("weight", "baseline".into()))
     }
 }

@@ -1,5 +1,6 @@
 //! `[actors]`.
 
+use shoal_base::report::MAX_ENVS;
 use shoal_base::section;
 use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
 
@@ -10,10 +11,10 @@ section! {
         /// Actor processes, each with its own environment server; at most `actors.max`, and at most 256.
         count: u32 = 2, unit: "processes", source: "ours", change: in_free_runs("its results depend on it");
         /// Environments that an actor steps at once.
-        envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours",
+        envs: u32 = 1, bounds: from(1, MAX_ENVS), unit: "environments", source: "ours",
             change: in_free_runs("saved states of its actors depend on it");
         /// Steps of every environment that are sent in one chunk. A chunk has `chunk_steps · envs` rows.
-        chunk_steps: u32 = 8, bounds: from(1, 4_096), unit: "steps", source: "ours",
+        chunk_steps: u32 = 8, bounds: from(1, ActorsConfig::MAX_CHUNK_STEPS), unit: "steps", source: "ours",
             change: in_free_runs("the length of a round depends on it");
         /// Chunks that an actor may have sent and the learner has not committed yet.
         window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
@@ -27,6 +28,9 @@ impl ActorsConfig {
     /// The most actors on one host. Those with an index below this have a service of their own for their transitions on
     /// the learner's host. All others are on joined hosts, and share one.
     pub const MAX_ON_A_HOST: u32 = 256;
+
+    /// The upper bound of `chunk_steps`.
+    pub const MAX_CHUNK_STEPS: u32 = 4_096;
 
     /// The upper bound of `max`.
     pub const MAX_ACTORS: u32 = Self::MAX_ON_A_HOST + 1_024;

@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn whether_a_key_may_change_is_what_its_declaration_says() {
+    fn a_key_may_change_if_its_declaration_says_so() {
         let refused = |text: &str, lockstep: bool| {
             let name = "[environment]\nname = \"x\"\n";
             let differences = parse(name).differences(&parse(&format!("{name}{text}")));

@@ -5,14 +5,11 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section::{Change, OutOfRange, from, never};
-use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::space::{EnvironmentSpec, MAX_EXACT_INTEGER, MAX_TIME_LIMIT, Space};
 
 /// Most numbers in an observation or an action: many more than any environment has, and few enough that no size
 /// computed from them overflows.
 const MAX_WIDTH: usize = 4_096;
-
-/// Most indices of a discrete space: a 32-bit float has every whole number up to this one.
-const MAX_INDICES: u64 = 1 << 24;
 
 /// Why the environment of a run and its parameters never change.
 pub(super) const CHANGES_ROWS: &str = "the rows in the replay come from this environment";
@@ -30,8 +27,8 @@ pub struct EnvironmentConfig {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("unit" = "–", "source" = "ours", "change" = never(CHANGES_SERVER)))]
     pub server: Vec<String>,
-    /// Invalid answers, such as an infinite reward, after which the run ends. Each one ends the episodes of its server,
-    /// and new ones begin.
+    /// The run ends after this many invalid answers, such as an infinite reward. After each one, the server's episodes
+    /// are dropped and new ones begin.
     #[serde(default = "default_faults", skip_serializing_if = "is_default_faults")]
     #[schemars(extend("unit" = "answers", "source" = "ours", "change" = Change::Anytime))]
     pub faults: u32,
@@ -106,16 +103,16 @@ impl EnvironmentConfig {
 pub(super) fn check_spec(spec: &EnvironmentSpec) -> Result<(), OutOfRange> {
     check_size("spec.observation", &spec.observation)?;
     check_size("spec.action", &spec.action)?;
-    from(1, 1_000_000).check("spec.time_limit", &spec.time_limit)
+    from(1, MAX_TIME_LIMIT).check("spec.time_limit", &spec.time_limit)
 }
 
 fn check_size(key: &str, space: &Space) -> Result<(), OutOfRange> {
     let (value, expected) = match space {
         Space::Discrete { n: 0, .. } => ("no index".into(), "one index or more".into()),
         // Rows and requests have the numbers of states and actions as 32-bit floats.
-        Space::Discrete { n, .. } if u64::from(*n) > MAX_INDICES => (
+        Space::Discrete { n, .. } if *n > MAX_EXACT_INTEGER => (
             format!("{n} indices"),
-            format!("at most {MAX_INDICES} (2^24) indices: choose an environment with fewer"),
+            format!("at most {MAX_EXACT_INTEGER} (2^24) indices: choose an environment with fewer"),
         ),
         Space::Box { low, high } if low.len() != high.len() || !(1..=MAX_WIDTH).contains(&low.len()) => (
             format!("{} lower and {} upper bounds", low.len(), high.len()),

@@ -31,7 +31,8 @@ impl TryFrom<u32> for IdentityFormat {
             0 => Ok(Self::Unnumbered),
             1 => Ok(Self::One),
             other => Err(format!(
-                "run.identity_format = {other}: this version of the program supports only 1"
+                "run.identity_format = {other}: this program knows formats up to 1; use the version of the program \
+                 that wrote this configuration"
             )),
         }
     }

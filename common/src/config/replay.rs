@@ -29,12 +29,12 @@ section! {
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
         tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours",
             change: Change::Anytime;
-        /// The environment step from which the ratio counts, if that is later than the warm-up: the ratio was changed
-        /// there.
+        /// The environment step at which the ratio was last changed. The ratio counts from there, or from the end of
+        /// the warm-up if that is later. 0 if it was never changed.
         #[serde(skip_serializing_if = "is_zero")]
         ratio_since: u64 = 0, bounds: from(0, COUNTER_LIMIT), unit: "environment steps", source: "ours",
             change: Change::ByProgram;
-        /// Updates that were allowed before `ratio_since`.
+        /// Updates that the ratio allowed up to `ratio_since`.
         #[serde(skip_serializing_if = "is_zero")]
         updates_before: u64 = 0, bounds: from(0, COUNTER_LIMIT), unit: "updates", source: "ours", change: Change::ByProgram;
     }
@@ -54,7 +54,7 @@ impl ReplayConfig {
         self.warmup.max(self.ratio_since)
     }
 
-    /// How many updates are agreed in total after `rows` environment steps.
+    /// The updates that the ratio allows in total after `rows` environment steps.
     pub fn allowed_updates(&self, rows: u64) -> u64 {
         let counted = rows.saturating_sub(self.ratio_start());
         self.updates_before + (counted as f64 * self.updates_per_step) as u64
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_ratio_counts_from_where_it_was_agreed() {
+    fn a_new_ratio_counts_from_the_step_of_its_change() {
         let before = ReplayConfig {
             warmup: 100,
             ..ReplayConfig::default()

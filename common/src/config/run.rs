@@ -28,8 +28,8 @@ section! {
         /// A process is replaced after this time without progress if the processes that it waits for are alive and wait
         /// too. Stopped processes and environments with long steps are not replaced.
         stall_seconds: u64 = 10, bounds: from(1, 86_400), unit: "s", source: "ours", change: Change::Anytime;
-        /// A role is given up, and the run fails, after five failed starts in a row, if they span at least this time
-        /// and at least twice its longest start.
+        /// The run fails if a role fails to start five times in a row and these starts span at least this time and
+        /// twice its longest start.
         give_up_seconds: u64 = 30, bounds: from(1, 86_400), unit: "s", source: "ours", change: Change::Anytime;
         /// The run that supplied the initial networks, from `--from`.
         #[serde(skip_serializing_if = "Option::is_none")]

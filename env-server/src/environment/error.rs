@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 
 pub use shoal_base::section::OutOfRange;
 use shoal_base::section::{from, in_user_words, refusal};
+use shoal_base::space::MAX_TIME_LIMIT;
 
 /// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -92,13 +93,13 @@ pub fn check(key: &str, value: f64, range: RangeInclusive<f64>) -> Result<(), Ou
 /// # Errors
 /// When it is 0 or above a million.
 pub fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
-    check("time_limit", time_limit.into(), 1.0..=1e6)
+    check("time_limit", time_limit.into(), 1.0..=f64::from(MAX_TIME_LIMIT))
 }
 
 /// An error about one of these parameters, as one line with the parameter's value.
 pub(super) fn wrong_parameter(parameters: &toml::Table, error: &toml::de::Error) -> String {
     let reason = in_user_words(error.message());
-    // The key stands only in the whole text.
+    // Only the error's full text names the key.
     let text = error.to_string();
     let place = text
         .lines()

@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 
 pub use parameters::PointMassParameters;
 use rand::RngExt;
-pub use reward::{Motion, Reward};
+pub use reward::{Motion, Reward, RewardTerms};
 use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,

@@ -204,7 +204,7 @@ fn scale(range: &ActionRange, actions: &[f32], scaled: &mut [f32]) {
     let width = range.width();
     for (to, action) in scaled.chunks_exact_mut(width).zip(actions.chunks_exact(width)) {
         for (element, (to, a)) in to.iter_mut().zip(action).enumerate() {
-            *to = range.scaled(element, *a);
+            *to = range.unscaled(element, *a);
         }
     }
 }

@@ -360,7 +360,7 @@ impl RolloutEnvironment {
 fn check_spec(config: &Config, found: &EnvironmentSpec) -> anyhow::Result<()> {
     let name = &config.environment.name;
     ensure!(
-        found.matches(&config.spec),
+        found.difference(&config.spec).is_none(),
         "config.toml: [spec] does not match the environment {name}"
     );
     Ok(())

@@ -193,7 +193,7 @@ fn set_from_predecessor(
         // Networks of another algorithm, which are refused later.
         return Ok(());
     }
-    let more = config.algorithm.settings().for_successor();
+    let more = config.algorithm.settings().inherited_setting();
     let more = more.map(|(key, value)| (config.algorithm.name(), key.to_owned(), value));
     for (section, key, value) in shapes(&config)?.into_iter().chain(more) {
         let name = format!("{section}.{key}");

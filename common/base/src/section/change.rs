@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 pub enum Change {
     /// It may change at any time: what is learned from given rows does not depend on it.
     Anytime,
-    /// It may change, but later updates depend on it: a lockstep run must have learned from all its complete rounds.
+    /// It may change, but later updates depend on it. So a lockstep run must first have learned from all its complete
+    /// rounds.
     Learning,
     /// It may change in a free run. In a lockstep run it may not, for this reason.
     InFreeRuns(Cow<'static, str>),

@@ -33,7 +33,7 @@ pub enum ControlRequest {
     JoinAgain(JoinAgain),
 }
 
-/// The numbers of actors that hosts shall have. A host that is not named keeps its number, or gets a share of `total`.
+/// The wanted numbers of actors. A host that is not named keeps its number, or gets a share of `total`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ScaleRequest {
     /// The number of the learner's host.
@@ -56,7 +56,7 @@ pub enum JoinAgain {
 /// What another host asks for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HostRequest {
-    /// A number that the host has drawn.
+    /// Identifies the host: a random number of its own choice.
     pub host: u64,
     /// Its name.
     pub name: String,
@@ -79,7 +79,7 @@ pub struct HostLease {
     pub epoch: u64,
     /// The indices of its actors.
     pub actors: Vec<u32>,
-    /// The number of actors that the run wants it to have. If it is another one, the host must join again.
+    /// The number of actors that the run wants it to have. If `actors` has another length, the host must join again.
     pub wanted_actors: u32,
     /// The number of its processor cores.
     pub cores: u32,

@@ -1,6 +1,8 @@
 //! Checks of what an environment returns. The client checks every response, whatever program serves the environment, so
 //! that later code need not expect NaN, infinities or impossible indices.
 
+use std::num::NonZeroU32;
+
 use shoal_base::space::{EnvironmentSpec, Space};
 
 use super::message::{Block, ResponseLayout};
@@ -20,7 +22,7 @@ pub enum ResponseFault {
         expected: usize,
     },
     /// An invalid number.
-    #[error("an environment returned {value} as {what} (environment {environment}); {expected}")]
+    #[error("environment {environment} returned {value} as {what}; {expected}")]
     Number {
         /// Index of the environment within the server.
         environment: usize,
@@ -32,11 +34,8 @@ pub enum ResponseFault {
         expected: String,
     },
     /// An episode that is longer than the environment's time limit.
-    #[error(
-        "an environment returned 0 as terminated and truncated after {limit} steps (environment {environment}); expected: 1 \
-         as one of them, because its time limit is {limit}"
-    )]
-    Endless {
+    #[error("environment {environment} goes on after {limit} steps, its time limit: terminated or truncated must be 1")]
+    TooLong {
         /// Index of the environment within the server.
         environment: usize,
         /// The time limit, in steps.
@@ -48,8 +47,8 @@ pub enum ResponseFault {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct EpisodeLengths {
     limit: u32,
-    /// Of each environment: the steps of its episode, and the episodes that it begins after this one. `None` if all its
-    /// episodes are over.
+    /// For each environment: the steps taken in its episode, and the number of episodes that follow it. `None` after
+    /// its last one.
     current: Vec<Option<(u32, u64)>>,
 }
 
@@ -62,12 +61,13 @@ impl EpisodeLengths {
         }
     }
 
-    /// This number of evaluation episodes, dealt to the environments in turn; 0 means no limit.
-    pub(super) fn of_evaluation(environments: usize, limit: u32, episodes: u32) -> Self {
-        if episodes == 0 {
-            return Self::of_training(environments, limit);
-        }
-        let further = |e: usize| (episodes as usize).checked_sub(e + 1).map(|left| left / environments);
+    /// This number of evaluation episodes, dealt to the environments in turn.
+    pub(super) fn of_evaluation(environments: usize, limit: u32, episodes: NonZeroU32) -> Self {
+        let further = |e: usize| {
+            (episodes.get() as usize)
+                .checked_sub(e + 1)
+                .map(|left| left / environments)
+        };
         Self {
             limit,
             current: (0..environments)
@@ -76,13 +76,14 @@ impl EpisodeLengths {
         }
     }
 
-    /// Counts a step of every environment; `ended` tells whether it was the last one of its episode.
+    /// Counts a step of every environment; `ended` tells whether it was the last one of its episode. An episode that
+    /// does not end with the step of the time limit is too long.
     pub(super) fn count(&mut self, ended: impl Fn(usize) -> bool) -> Result<(), ResponseFault> {
         let limit = self.limit;
         for (environment, current) in self.current.iter_mut().enumerate() {
             *current = match *current {
                 Some((_, left)) if ended(environment) => left.checked_sub(1).map(|left| (0, left)),
-                Some((steps, _)) if steps >= limit => return Err(ResponseFault::Endless { environment, limit }),
+                Some((steps, _)) if steps + 1 >= limit => return Err(ResponseFault::TooLong { environment, limit }),
                 Some((steps, left)) => Some((steps + 1, left)),
                 None => None,
             };
@@ -167,35 +168,35 @@ mod tests {
     fn an_episode_beyond_the_time_limit_is_a_fault_unless_the_environment_is_done() {
         let mut training = EpisodeLengths::of_training(2, 3);
         for _ in 0..5 {
-            for _ in 0..3 {
+            for _ in 0..2 {
                 training.count(|_| false).unwrap();
             }
             training.count(|_| true).unwrap();
         }
-        for _ in 0..3 {
+        for _ in 0..2 {
             training.count(|e| e == 0).unwrap();
         }
-        let endless = ResponseFault::Endless {
+        let too_long = ResponseFault::TooLong {
             environment: 1,
             limit: 3,
         };
-        assert_eq!(training.count(|e| e == 0), Err(endless.clone()));
+        assert_eq!(training.count(|e| e == 0), Err(too_long));
 
         // Two episodes: the third environment has none.
-        let mut evaluation = EpisodeLengths::of_evaluation(3, 3, 2);
+        let mut evaluation = EpisodeLengths::of_evaluation(3, 3, NonZeroU32::new(2).unwrap());
         evaluation.count(|e| e < 2).unwrap();
         for _ in 0..10 {
             evaluation.count(|_| false).unwrap();
         }
         // Three episodes: the first environment has two of them.
-        let mut evaluation = EpisodeLengths::of_evaluation(2, 3, 3);
+        let mut evaluation = EpisodeLengths::of_evaluation(2, 3, NonZeroU32::new(3).unwrap());
         evaluation.count(|_| true).unwrap();
-        for _ in 0..3 {
+        for _ in 0..2 {
             evaluation.count(|_| false).unwrap();
         }
         assert!(matches!(
             evaluation.count(|_| false),
-            Err(ResponseFault::Endless { environment: 0, .. })
+            Err(ResponseFault::TooLong { environment: 0, .. })
         ));
     }
 

@@ -1,6 +1,7 @@
 //! The client: an actor or the evaluator asks its environment server for resets and steps.
 
 use std::cell::{Cell, RefCell};
+use std::num::NonZeroU32;
 use std::time::Instant;
 
 use iceoryx2::identifiers::UniqueServerId;
@@ -33,9 +34,8 @@ pub enum ResetRequest {
     Evaluation {
         /// Number of the first episode.
         first: u64,
-        /// Number of episodes; 0 means no limit. An environment whose next episode would be beyond them is not reset
-        /// again.
-        episodes: u32,
+        /// Number of episodes. An environment whose next episode would be beyond them is not reset again.
+        episodes: NonZeroU32,
     },
 }
 
@@ -219,7 +219,7 @@ impl EnvironmentClient {
             ResetRequest::Next => RequestHeader::new(RequestKind::Reset, 0, 0),
             ResetRequest::Training(episode) => RequestHeader::new(RequestKind::ResetToTraining, episode, 0),
             ResetRequest::Evaluation { first, episodes } => {
-                RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes)
+                RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes.get())
             }
         };
         let (environments, limit) = (self.layout.environments, self.spec.time_limit);
@@ -300,7 +300,7 @@ impl EnvironmentClient {
             numbers_of(words),
             &mut idle,
         )?;
-        // How many steps the episodes have is in words that only the server understands.
+        // Only the server knows how many steps the restored episodes have had, so the count begins at 0.
         let lengths = EpisodeLengths::of_training(self.layout.environments, self.spec.time_limit);
         self.accept_episodes(response, lengths)
     }

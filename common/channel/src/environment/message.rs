@@ -2,7 +2,7 @@
 //! languages.
 
 use iceoryx2::prelude::ZeroCopySend;
-use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::space::{EnvironmentSpec, MAX_EXACT_INTEGER, Space};
 
 /// The kinds of requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -142,8 +142,7 @@ impl ResponseHeader {
 
 /// A whole number that is exact as an `f32`.
 fn whole(number: f32) -> Option<i32> {
-    const EXACT: f32 = 16_777_216.0;
-    (number.fract() == 0.0 && number.abs() <= EXACT).then_some(number as i32)
+    (number.fract() == 0.0 && number.abs() <= MAX_EXACT_INTEGER as f32).then_some(number as i32)
 }
 
 /// The layout of a response: its blocks, each of them environment after environment.

@@ -4,7 +4,6 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
     RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
 };
-use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 use shoal_base::packing::NUMBERS_PER_WORD;
 use shoal_base::space::EnvironmentSpec;
@@ -60,12 +59,7 @@ pub(super) fn name(index: u32) -> String {
 
 /// Creates the service of environment server `index`.
 pub(crate) fn create(domain: &Domain, index: u32) -> Result<HeldService, ChannelError> {
-    let service = service(domain, &name(index), OpenMode::Create)?;
-    Ok(HeldService::new(move |visit| {
-        let ports = service.dynamic_config();
-        ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
-        ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
-    }))
+    service(domain, &name(index), OpenMode::Create).map(HeldService::of_request_response)
 }
 
 pub(super) type EnvironmentService = PortFactory<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;

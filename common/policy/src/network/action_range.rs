@@ -90,7 +90,7 @@ impl ActionRange {
 
     /// The inverse of [`action`](Self::action): element `element` of an action in units of half its range, from the
     /// middle.
-    pub fn scaled(&self, element: usize, a: f32) -> f32 {
+    pub fn unscaled(&self, element: usize, a: f32) -> f32 {
         (a - self.centre[element]) / self.half[element]
     }
 
@@ -117,7 +117,7 @@ mod tests {
             }
         }
         assert!(range.action(0, f32::NAN).is_nan(), "what diverges is not hidden");
-        assert!((range.scaled(1, range.action(1, 0.25)) - 0.25).abs() < 1e-6);
+        assert!((range.unscaled(1, range.action(1, 0.25)) - 0.25).abs() < 1e-6);
     }
 
     #[test]

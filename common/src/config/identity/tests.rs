@@ -285,7 +285,7 @@ fn an_unknown_format_is_refused_in_one_line() {
         .unwrap_err()
         .to_string();
     assert!(
-        line.contains("run.identity_format = 2: this version") && !line.contains('\n'),
+        line.contains("run.identity_format = 2: this program") && !line.contains('\n'),
         "{line}"
     );
 }

@@ -1,12 +1,12 @@
 //! Parameters of the point mass. They are flat in TOML, so that one key changes one number. In Rust, each reward has
-//! its own parameters.
+//! only its own parameters.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{
     super::{OutOfRange, check, check_time_limit},
-    reward::Reward,
+    reward::{Reward, RewardTerms},
 };
 
 /// Parameters of the point mass. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"`, and the reward's parameters are keys
@@ -39,39 +39,25 @@ impl PointMassParameters {
         check("gravity", self.gravity, 0.0..=100.0)?;
         check("goal_radius", self.goal_radius, 0.0..=10.0)?;
         check_time_limit(self.time_limit)?;
-        let (Reward::R1 {
+        let Reward {
             amplitude,
             variance,
             c_d,
-        }
-        | Reward::R2 {
-            amplitude,
-            variance,
-            c_d,
-            ..
-        }
-        | Reward::R3 {
-            amplitude,
-            variance,
-            c_d,
-            ..
-        }) = self.reward;
+            terms,
+        } = self.reward;
         check("amplitude", amplitude, 0.0..=1e3)?;
         check("variance", variance, 1e-6..=1e3)?;
         check("c_d", c_d, 0.0..=1e3)?;
-        match self.reward {
-            Reward::R1 { .. } => Ok(()),
-            Reward::R2 {
+        match terms {
+            RewardTerms::R1 => Ok(()),
+            RewardTerms::R2 {
                 c_theta_dot,
                 c_force_dot,
-                ..
             } => {
                 check("c_theta_dot", c_theta_dot, 0.0..=1e3)?;
                 check("c_force_dot", c_force_dot, 0.0..=1e3)
             }
-            Reward::R3 {
-                c_theta_dot, c_force, ..
-            } => {
+            RewardTerms::R3 { c_theta_dot, c_force } => {
                 check("c_theta_dot", c_theta_dot, 0.0..=1e3)?;
                 check("c_force", c_force, 0.0..=1e3)
             }
@@ -161,35 +147,30 @@ impl TryFrom<PointMassTable> for PointMassParameters {
 
     fn try_from(mut flat: PointMassTable) -> Result<Self, String> {
         let given_or = |given: &mut Option<f64>, default| given.take().unwrap_or(default);
-        let (name, reward) = match flat.reward {
-            Name::R1 => (
-                "r1",
-                Reward::R1 {
-                    amplitude: given_or(&mut flat.amplitude, 1.0),
-                    variance: given_or(&mut flat.variance, 0.4),
-                    c_d: given_or(&mut flat.c_d, 1.0),
-                },
-            ),
+        let (name, [amplitude, variance, c_d], terms) = match flat.reward {
+            Name::R1 => ("r1", [1.0, 0.4, 1.0], RewardTerms::R1),
             Name::R2 => (
                 "r2",
-                Reward::R2 {
-                    amplitude: given_or(&mut flat.amplitude, 2.0),
-                    variance: given_or(&mut flat.variance, 0.1),
-                    c_d: given_or(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                [2.0, 0.1, std::f64::consts::FRAC_1_SQRT_2],
+                RewardTerms::R2 {
                     c_theta_dot: given_or(&mut flat.c_theta_dot, 0.0015),
                     c_force_dot: given_or(&mut flat.c_force_dot, 0.0),
                 },
             ),
             Name::R3 => (
                 "r3",
-                Reward::R3 {
-                    amplitude: given_or(&mut flat.amplitude, 2.0),
-                    variance: given_or(&mut flat.variance, 0.1),
-                    c_d: given_or(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                [2.0, 0.1, std::f64::consts::FRAC_1_SQRT_2],
+                RewardTerms::R3 {
                     c_theta_dot: given_or(&mut flat.c_theta_dot, 0.0015),
                     c_force: given_or(&mut flat.c_force, 0.03),
                 },
             ),
+        };
+        let reward = Reward {
+            amplitude: given_or(&mut flat.amplitude, amplitude),
+            variance: given_or(&mut flat.variance, variance),
+            c_d: given_or(&mut flat.c_d, c_d),
+            terms,
         };
         let others = [
             ("c_theta_dot", flat.c_theta_dot, "r2 or r3"),
@@ -233,33 +214,19 @@ impl From<PointMassParameters> for PointMassTable {
             time_limit,
             reward,
         } = parameters;
-        let (Reward::R1 {
+        let Reward {
             amplitude,
             variance,
             c_d,
-        }
-        | Reward::R2 {
-            amplitude,
-            variance,
-            c_d,
-            ..
-        }
-        | Reward::R3 {
-            amplitude,
-            variance,
-            c_d,
-            ..
-        }) = reward;
-        let (name, c_theta_dot, c_force_dot, c_force) = match reward {
-            Reward::R1 { .. } => (Name::R1, None, None, None),
-            Reward::R2 {
+            terms,
+        } = reward;
+        let (name, c_theta_dot, c_force_dot, c_force) = match terms {
+            RewardTerms::R1 => (Name::R1, None, None, None),
+            RewardTerms::R2 {
                 c_theta_dot,
                 c_force_dot,
-                ..
             } => (Name::R2, Some(c_theta_dot), Some(c_force_dot), None),
-            Reward::R3 {
-                c_theta_dot, c_force, ..
-            } => (Name::R3, Some(c_theta_dot), None, Some(c_force)),
+            RewardTerms::R3 { c_theta_dot, c_force } => (Name::R3, Some(c_theta_dot), None, Some(c_force)),
         };
         Self {
             mass,
@@ -292,28 +259,29 @@ mod tests {
     fn each_reward_has_the_defaults_of_its_section() {
         assert_eq!(
             parameters("reward = 'r1'").reward,
-            Reward::R1 {
+            Reward {
                 amplitude: 1.0,
                 variance: 0.4,
-                c_d: 1.0
+                c_d: 1.0,
+                terms: RewardTerms::R1
             }
         );
         let (amplitude, variance, c_d, c_theta_dot) = (2.0, 0.1, 0.5f64.sqrt(), 0.0015);
-        let r2 = Reward::R2 {
+        let of = |terms| Reward {
             amplitude,
             variance,
             c_d,
+            terms,
+        };
+        let r2 = of(RewardTerms::R2 {
             c_theta_dot,
             c_force_dot: 0.0,
-        };
+        });
         assert_eq!(parameters("reward = 'r2'").reward, r2);
-        let r3 = Reward::R3 {
-            amplitude,
-            variance,
-            c_d,
+        let r3 = of(RewardTerms::R3 {
             c_theta_dot,
             c_force: 0.03,
-        };
+        });
         assert_eq!(parameters("reward = 'r3'").reward, r3);
         assert_eq!(parameters("").reward, r3);
     }
@@ -323,11 +291,10 @@ mod tests {
         let changed = parameters("friction = 0.03\nreward = 'r2'\nc_force_dot = 1");
         assert_eq!((changed.friction, changed.mass), (0.03, 1.0));
         assert!(matches!(
-            changed.reward,
-            Reward::R2 {
+            changed.reward.terms,
+            RewardTerms::R2 {
                 c_force_dot: 1.0,
                 c_theta_dot: 0.0015,
-                ..
             }
         ));
     }

@@ -2,24 +2,24 @@
 
 /// A reward function and its parameters. The defaults are those of its part of section 5.3.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Reward {
+pub struct Reward {
+    /// Amplitude a of the Gaussian of the distance.
+    pub amplitude: f64,
+    /// Its variance σ², in m².
+    pub variance: f64,
+    /// c_d: in r1 the bonus within the goal radius; in r2 and r3 the weight of ḋ outside it.
+    pub c_d: f64,
+    /// The terms, with the parameters that only some rewards have.
+    pub terms: RewardTerms,
+}
+
+/// The terms of a reward function.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum RewardTerms {
     /// Equation (5.10): a Gaussian of the distance, and a bonus at the goal.
-    R1 {
-        /// Amplitude a of the Gaussian.
-        amplitude: f64,
-        /// Its variance σ², in m².
-        variance: f64,
-        /// Bonus c_d within the goal radius.
-        c_d: f64,
-    },
+    R1,
     /// Equation (5.11): progress, a Gaussian at the goal, and penalties on quickly changing inputs.
     R2 {
-        /// Amplitude a of the Gaussian.
-        amplitude: f64,
-        /// Its variance σ², in m².
-        variance: f64,
-        /// Weight c_d of ḋ outside the goal radius.
-        c_d: f64,
         /// Weight of θ̇².
         c_theta_dot: f64,
         /// Weight of Ḟ_u².
@@ -27,12 +27,6 @@ pub enum Reward {
     },
     /// Equation (5.12): as r2, with a penalty on the force instead of its change.
     R3 {
-        /// Amplitude a of the Gaussian.
-        amplitude: f64,
-        /// Its variance σ², in m².
-        variance: f64,
-        /// Weight c_d of ḋ outside the goal radius.
-        c_d: f64,
         /// Weight of θ̇².
         c_theta_dot: f64,
         /// Weight of F_u².
@@ -65,41 +59,23 @@ impl Reward {
             force,
             force_dot,
         } = *motion;
+        let Self {
+            amplitude,
+            variance,
+            c_d,
+            terms,
+        } = *self;
         let at_goal = d < goal_radius;
-        let gaussian = |amplitude: f64, variance: f64| amplitude * (-d.powi(2) / (2.0 * variance)).exp();
-        match *self {
-            Self::R1 {
-                amplitude,
-                variance,
-                c_d,
-            } => gaussian(amplitude, variance) + if at_goal { c_d } else { 0.0 },
-            Self::R2 {
-                amplitude,
-                variance,
-                c_d,
+        let gaussian = || amplitude * (-d.powi(2) / (2.0 * variance)).exp();
+        let progress = || if at_goal { gaussian() } else { -c_d * d_dot };
+        match terms {
+            RewardTerms::R1 => gaussian() + if at_goal { c_d } else { 0.0 },
+            RewardTerms::R2 {
                 c_theta_dot,
                 c_force_dot,
-            } => {
-                -c_force_dot * force_dot.powi(2) - c_theta_dot * theta_dot.powi(2)
-                    + if at_goal {
-                        gaussian(amplitude, variance)
-                    } else {
-                        -c_d * d_dot
-                    }
-            }
-            Self::R3 {
-                amplitude,
-                variance,
-                c_d,
-                c_theta_dot,
-                c_force,
-            } => {
-                -c_force * force.powi(2) - c_theta_dot * theta_dot.powi(2)
-                    + if at_goal {
-                        gaussian(amplitude, variance)
-                    } else {
-                        -c_d * d_dot
-                    }
+            } => -c_force_dot * force_dot.powi(2) - c_theta_dot * theta_dot.powi(2) + progress(),
+            RewardTerms::R3 { c_theta_dot, c_force } => {
+                -c_force * force.powi(2) - c_theta_dot * theta_dot.powi(2) + progress()
             }
         }
     }
@@ -127,10 +103,11 @@ mod tests {
 
     #[test]
     fn r1_by_hand() {
-        let r1 = Reward::R1 {
+        let r1 = Reward {
             amplitude: 1.0,
             variance: 0.4,
             c_d: 1.0,
+            terms: RewardTerms::R1,
         };
         assert_reward(r1, MOTION, (-0.3125f64).exp());
         assert_reward(r1, Motion { d: 0.04, ..MOTION }, (-0.002f64).exp() + 1.0);
@@ -141,12 +118,14 @@ mod tests {
     #[test]
     fn r2_by_hand() {
         let c_d = 0.5f64.sqrt();
-        let r2 = |c_force_dot| Reward::R2 {
+        let r2 = |c_force_dot| Reward {
             amplitude: 2.0,
             variance: 0.1,
             c_d,
-            c_theta_dot: 0.0015,
-            c_force_dot,
+            terms: RewardTerms::R2 {
+                c_theta_dot: 0.0015,
+                c_force_dot,
+            },
         };
         assert_reward(r2(0.0), MOTION, -0.15 + 0.6 * c_d);
         assert_reward(r2(0.01), MOTION, -0.16 - 0.15 + 0.6 * c_d);
@@ -165,12 +144,14 @@ mod tests {
     #[test]
     fn r3_by_hand() {
         let c_d = 0.5f64.sqrt();
-        let r3 = Reward::R3 {
+        let r3 = Reward {
             amplitude: 2.0,
             variance: 0.1,
             c_d,
-            c_theta_dot: 0.0015,
-            c_force: 0.03,
+            terms: RewardTerms::R3 {
+                c_theta_dot: 0.0015,
+                c_force: 0.03,
+            },
         };
         assert_reward(r3, MOTION, -0.0675 - 0.15 + 0.6 * c_d);
         assert_reward(

@@ -21,9 +21,9 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Shows that this process is a member of a run.
 #[derive(Debug)]
-pub(super) struct Presence(Option<File>);
+pub(super) struct Membership(Option<File>);
 
-/// The right to remove a run's files, or who has them.
+/// Whether this process may remove a run's files.
 #[derive(Debug)]
 pub(super) enum Claim {
     /// No member is alive, and none can join before this is dropped: it holds the lock.
@@ -32,8 +32,9 @@ pub(super) enum Claim {
     Held,
 }
 
-impl Presence {
-    /// Becomes a member. Where another user has a file of this name, nothing shows that this process is a member.
+impl Membership {
+    /// Becomes a member. If another user owns a file of this name, the process joins without a lock, and its membership
+    /// cannot be seen.
     ///
     /// # Errors
     /// When the file cannot be made or locked.
@@ -99,7 +100,7 @@ pub(super) fn runs() -> io::Result<Vec<String>> {
 }
 
 /// Whether this is the name of such a file.
-pub(super) fn is_presence(name: &str) -> bool {
+pub(super) fn is_members_file(name: &str) -> bool {
     name.ends_with(&format!("_{MEMBERS}"))
 }
 
@@ -141,8 +142,8 @@ mod tests {
     fn a_run_is_free_once_all_its_members_have_left() {
         let run_id = format!("pr{:x}", std::process::id());
         assert!(matches!(claim(&run_id).unwrap(), Claim::Free { _lock: None }));
-        let (first, second) = (Presence::enter(&run_id).unwrap(), Presence::enter(&run_id).unwrap());
-        assert!(runs().unwrap().contains(&run_id) && is_presence(&path(&run_id).to_string_lossy()));
+        let (first, second) = (Membership::enter(&run_id).unwrap(), Membership::enter(&run_id).unwrap());
+        assert!(runs().unwrap().contains(&run_id) && is_members_file(&path(&run_id).to_string_lossy()));
         assert!(members(&run_id).contains(&(std::process::id() as i32)));
         first.leave();
         assert!(matches!(claim(&run_id).unwrap(), Claim::Held));
@@ -152,7 +153,7 @@ mod tests {
         };
         std::fs::remove_file(path(&run_id)).unwrap();
         // Whoever joins now makes a new file.
-        let third = Presence::enter(&run_id).unwrap();
+        let third = Membership::enter(&run_id).unwrap();
         drop(claimed);
         assert!(matches!(claim(&run_id).unwrap(), Claim::Held));
         third.leave();
