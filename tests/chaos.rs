@@ -25,7 +25,7 @@ struct Kill {
 }
 
 /// The results of one chaos run.
-struct Figures {
+struct ChaosResults {
     kills: usize,
     /// Seconds from each kill until the successor was ready, ascending.
     recoveries: Vec<f64>,
@@ -200,8 +200,8 @@ fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
 }
 
 /// Kills and scales for `length` in a run started with `arguments`, stops it, and resumes it to at least `steps`.
-/// Returns the figures and the result of the resumed run.
-fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figures, Value) {
+/// Returns the results and what the resumed run printed.
+fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (ChaosResults, Value) {
     let place = Workplace::logging_chunks();
     let begin = ["train", "pendulum", "--run", "run", "--steps", "100000000"];
     let running = place.launch("run", &[&begin[..], arguments].concat());
@@ -230,7 +230,7 @@ fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figure
         .filter_map(|kill| Some(ready_again(&log, kill)? - kill.at))
         .collect();
     recoveries.sort_by(f64::total_cmp);
-    let figures = Figures {
+    let results = ChaosResults {
         kills: kills.len(),
         recoveries,
         rows,
@@ -238,10 +238,10 @@ fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figure
         scalings,
         silence,
     };
-    (figures, parse(&printed))
+    (results, parse(&printed))
 }
 
-impl std::fmt::Display for Figures {
+impl std::fmt::Display for ChaosResults {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let n = self.recoveries.len();
         let at = |share: f64| {
@@ -269,17 +269,17 @@ impl std::fmt::Display for Figures {
 #[test]
 fn every_sent_row_is_in_the_replay_once_after_random_kills() {
     let arguments = [&support::QUICK[..], &["--set", "replay.capacity=200000"]].concat();
-    let (figures, result) = chaos(20, Duration::from_secs(20), &arguments, 0);
-    eprintln!("{figures}");
-    assert!(figures.kills >= 5 && figures.scalings >= 1 && figures.recoveries.len() >= 4);
+    let (results, result) = chaos(20, Duration::from_secs(20), &arguments, 0);
+    eprintln!("{results}");
+    assert!(results.kills >= 5 && results.scalings >= 1 && results.recoveries.len() >= 4);
     assert_eq!(result["updates"], result["env_steps"].as_u64().unwrap() - 64);
 }
 
 #[test]
 #[ignore = "takes minutes"]
 fn the_pendulum_still_swings_up_after_a_minute_of_random_kills() {
-    let (figures, result) = chaos(60, Duration::from_secs(60), &[], 30_000);
-    eprintln!("{figures}; the best policy: {}", result["eval_return_mean"]);
-    assert!(figures.kills >= 20 && figures.scalings >= 3);
+    let (results, result) = chaos(60, Duration::from_secs(60), &[], 30_000);
+    eprintln!("{results}; the best policy: {}", result["eval_return_mean"]);
+    assert!(results.kills >= 20 && results.scalings >= 3);
     assert!(result["eval_return_mean"].as_f64().unwrap() > -250.0, "{result}");
 }

@@ -180,13 +180,13 @@ def main():
     parser.add_argument("what", choices=["learner", "actors"])
     if parser.parse_args().what == "learner":
         replay = Replay()
-        figures = {
+        results = {
             "jax_updates_per_second": jax_updates(replay),
             "torch_updates_per_second": torch_updates(replay),
         }
     else:
-        figures = {f"{mode}_vector_rows_per_second": rows_of_gymnasium(mode) for mode in ("sync", "async")}
-    print(json.dumps(figures))
+        results = {f"{mode}_vector_rows_per_second": rows_of_gymnasium(mode) for mode in ("sync", "async")}
+    print(json.dumps(results))
 
 
 if __name__ == "__main__":

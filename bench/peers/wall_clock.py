@@ -178,13 +178,13 @@ def main():
         for who, reached in times.items()
     }
     ratio = medians["stable_baselines3"] / medians["shoal"]
-    figures = {
+    results = {
         "threshold": THRESHOLD,
         "seconds_and_steps": times,
         "median_seconds": {who: finite(median) for who, median in medians.items()},
         "times_as_fast": finite(ratio),
     }
-    print(json.dumps(figures))
+    print(json.dumps(results))
 
 
 def finite(number):

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::costs::{self, Costs};
 use super::intervals::Samples;
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
 use super::processes::Processes;
@@ -35,7 +35,7 @@ const MODEL_ACTORS: [u32; 7] = [1, 2, 4, 8, 16, 32, 64];
 
 /// The fields of `bench actors --json`.
 #[derive(Serialize)]
-pub(super) struct ActorFigures {
+pub(super) struct ActorResults {
     cores: u32,
     environments_per_actor: usize,
     chunk_rows: usize,
@@ -104,7 +104,7 @@ fn counts(typed: Option<&str>, cores: u32) -> anyhow::Result<Vec<u32>> {
     Ok(counts)
 }
 
-pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Result<ActorFigures> {
+pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Result<ActorResults> {
     let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
     let counts = counts(typed, cores)?;
     let [counting, alone, stages] = SHARES.map(|share| budget.length.mul_f64(share));
@@ -153,7 +153,7 @@ pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Resul
             learning: rate(learning, first_learning, true),
         }
     });
-    Ok(ActorFigures {
+    Ok(ActorResults {
         cores,
         environments_per_actor: ENVIRONMENTS,
         chunk_rows: config.chunk_rows(),

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::config::EnvironmentConfig;
 use shoal_run::external_environment::{ExternalEnvironment, default_command};
 
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::step::quantile_of;
 
 const NAME: &str = "gym:Pendulum-v1";
@@ -25,7 +25,7 @@ const WARM_UP: f64 = 0.1;
 
 /// The fields of `bench gym --json`.
 #[derive(Serialize)]
-pub(super) struct GymFigures {
+pub(super) struct GymResults {
     environment: &'static str,
     /// Round trip to a server with one environment, its step included.
     round_trip_median_us: f64,
@@ -45,7 +45,7 @@ struct Gymnasium {
     async_vector_steps_per_second: f64,
 }
 
-pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<GymFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<GymResults> {
     let server = default_command(NAME).context("found no server for Gymnasium's environments")?;
     let environment = EnvironmentConfig::new(NAME.into(), server, toml::Table::new());
     let length = budget.length.mul_f64(SHARE);
@@ -53,7 +53,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<GymFigures> {
     let together = times(&environment, ENVIRONMENTS, length, budget)?;
     let nanoseconds: f64 = together.iter().map(|ns| f64::from(*ns)).sum();
     alone.sort_unstable();
-    Ok(GymFigures {
+    Ok(GymResults {
         environment: NAME,
         round_trip_median_us: quantile_of(&alone, 0.5),
         round_trip_p99_us: quantile_of(&alone, 0.99),
@@ -103,11 +103,11 @@ fn gymnasium(environment: &EnvironmentConfig, length: Duration) -> anyhow::Resul
         output.status.success(),
         "could not measure Gymnasium's own vector environments"
     );
-    serde_json::from_slice(&output.stdout).context("shoal_gym.peers printed no figures")
+    serde_json::from_slice(&output.stdout).context("shoal_gym.peers printed no results")
 }
 
-impl Figures for GymFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
+impl StageResults for GymResults {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let rate = |steps: f64| format!("{steps:.0} steps/s");
         vec![
             ("environment", self.environment.into()),

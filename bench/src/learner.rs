@@ -15,10 +15,10 @@ use shoal_learner::replay::Replay;
 use toml::{Table, Value};
 
 use super::intervals::{self, Samples};
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::target::{Line, Target};
+use super::target::{Target, TargetRow};
 use super::temporary_run::TemporaryRun;
 
 const INTERVAL: Duration = Duration::from_millis(100);
@@ -38,21 +38,21 @@ const WARM_UP: f64 = 0.05;
 
 /// The fields of `bench learner --json`.
 #[derive(Serialize)]
-pub(super) struct LearnerFigures {
+pub(super) struct LearnerResults {
     #[serde(rename = "method")]
     algorithm: String,
     #[serde(flatten)]
-    configured: BatchFigures,
+    configured: BatchResults,
     /// Missing if the configured minibatches have this size.
     #[serde(skip_serializing_if = "Option::is_none")]
-    large_batch: Option<BatchFigures>,
+    large_batch: Option<BatchResults>,
     two_threads: TwoThreads,
     replay_rows: u64,
 }
 
 /// The results for one minibatch size, on one thread. An update is one gradient step of every network.
 #[derive(Serialize)]
-struct BatchFigures {
+struct BatchResults {
     batch: usize,
     updates_per_second: f64,
     /// Counts the matrix products only.
@@ -84,7 +84,7 @@ struct TwoThreads {
 }
 
 /// Measures one of the [algorithms](super::algorithms), by default DDPG.
-pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<LearnerFigures> {
+pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<LearnerResults> {
     let temporary = TemporaryRun::with_algorithm(algorithm)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     // The mapping outlives the file, so nothing is left behind even if this process is killed.
@@ -113,8 +113,8 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
         large.iter_mut().for_each(|large| large.measure(&replay));
     }
 
-    let configured = configured.figure();
-    Ok(LearnerFigures {
+    let configured = configured.results();
+    Ok(LearnerResults {
         algorithm: config.algorithm.name().into(),
         two_threads: TwoThreads {
             updates_per_second: updates_of_two.median(),
@@ -122,7 +122,7 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
             updates: updates_of_two,
         },
         configured,
-        large_batch: large.map(Case::figure),
+        large_batch: large.map(Case::results),
         replay_rows: replay.head(),
     })
 }
@@ -206,10 +206,10 @@ impl Case {
             .add(intervals::rate(INTERVAL, || self.sequence.multiply_all()) * flop_of_sequence / 1e9);
     }
 
-    fn figure(self) -> BatchFigures {
+    fn results(self) -> BatchResults {
         let flop = self.flop_per_update;
         let achieved = flop as f64 * self.updates.median() / 1e9;
-        BatchFigures {
+        BatchResults {
             batch: self.batch,
             updates_per_second: self.updates.median(),
             flop_per_update: flop,
@@ -267,8 +267,8 @@ fn product_sequence(config: &Config, products: &Products) -> (ProductSequence, T
     (ProductSequence { distinct, order }, fastest)
 }
 
-impl BatchFigures {
-    fn lines(&self) -> [(&'static str, String); 4] {
+impl BatchResults {
+    fn entries(&self) -> [(&'static str, String); 4] {
         [
             (
                 "updates a second",
@@ -301,8 +301,8 @@ impl BatchFigures {
     }
 }
 
-impl Figures for LearnerFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
+impl StageResults for LearnerResults {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let two = &self.two_threads;
         let two = format!(
             "{}, batch {}, two threads: {:.2} times one",
@@ -310,35 +310,35 @@ impl Figures for LearnerFigures {
             self.configured.batch,
             two.speedup
         );
-        let mut lines = vec![("algorithm", self.algorithm.clone())];
-        lines.extend(self.configured.lines());
-        lines.push(("updates a second", two));
-        lines.extend(self.large_batch.iter().flat_map(BatchFigures::lines));
-        lines.push(("rows in the replay", self.replay_rows.to_string()));
-        lines
+        let mut entries = vec![("algorithm", self.algorithm.clone())];
+        entries.extend(self.configured.entries());
+        entries.push(("updates a second", two));
+        entries.extend(self.large_batch.iter().flat_map(BatchResults::entries));
+        entries.push(("rows in the replay", self.replay_rows.to_string()));
+        entries
     }
 
-    fn table(&self) -> Vec<Line> {
-        let of = |figure: &BatchFigures, stage, target| Line {
+    fn target_rows(&self) -> Vec<TargetRow> {
+        let of = |results: &BatchResults, stage, target| TargetRow {
             stage,
-            ours: format!("{:.0} updates/s", figure.updates_per_second),
+            ours: format!("{:.0} updates/s", results.updates_per_second),
             limit: format!(
                 "{:.0}: its products at {:.0} GFLOP/s",
-                figure.updates_per_second / figure.share_of_limit,
-                figure.limit_gflops
+                results.updates_per_second / results.share_of_limit,
+                results.limit_gflops
             ),
-            share: Some(figure.share_of_limit),
+            share: Some(results.share_of_limit),
             target,
         };
         let two = &self.two_threads;
         let small = self.configured.share_of_limit;
-        let mut lines = vec![
+        let mut rows = vec![
             of(
                 &self.configured,
                 "learner, batch 64",
                 Target::at_least(0.75, small, "0.75 of the limit"),
             ),
-            Line {
+            TargetRow {
                 stage: "learner, batch 64, two threads",
                 ours: format!(
                     "{:.0} updates/s, {:.2} times one thread",
@@ -349,10 +349,10 @@ impl Figures for LearnerFigures {
                 target: Target::at_least(1.6, two.speedup, "1.6 times one thread"),
             },
         ];
-        lines.extend(self.large_batch.iter().map(|large| {
+        rows.extend(self.large_batch.iter().map(|large| {
             let target = Target::at_least(0.85, large.share_of_limit, "0.85 of the limit");
             of(large, "learner, batch 256", target)
         }));
-        lines
+        rows
     }
 }

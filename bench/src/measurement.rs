@@ -12,7 +12,7 @@ use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 use shoal_run::signals::Signals;
 
-use super::target::Line;
+use super::target::TargetRow;
 
 /// Environment variable for the length of a measurement in seconds. Tests set it low: they check the form of the
 /// output.
@@ -22,14 +22,14 @@ const DEFAULT_SECONDS: f64 = 6.0;
 /// The error message after the user interrupted.
 pub(super) const INTERRUPTED: &str = "interrupted";
 
-/// The result of a stage. Its serialized fields are the fields of `--json`.
-pub(super) trait Figures: Serialize {
-    /// The result for the user: pairs of a name and a value.
-    fn lines(&self) -> Vec<(&'static str, String)>;
+/// The results of a stage. Their serialized fields are the fields of `--json`.
+pub(super) trait StageResults: Serialize {
+    /// The results for the user: pairs of a name and a value.
+    fn entries(&self) -> Vec<(&'static str, String)>;
 
-    /// The most important figures with limits and targets, for the table of `bench all`; empty if `all` omits the
+    /// The most important results with limits and targets, for the table of `bench all`; empty if `all` omits the
     /// stage.
-    fn table(&self) -> Vec<Line> {
+    fn target_rows(&self) -> Vec<TargetRow> {
         Vec::new()
     }
 }
@@ -85,13 +85,13 @@ impl TimeBudget {
     }
 }
 
-pub(super) fn print(figures: &impl Figures, json: bool) -> anyhow::Result<()> {
+pub(super) fn print(results: &impl StageResults, json: bool) -> anyhow::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
-    for (what, how_much) in figures.lines() {
+    for (what, how_much) in results.entries() {
         table.add_row([what, &how_much]);
     }
-    let json = json.then(|| serde_json::to_string(figures)).transpose()?;
+    let json = json.then(|| serde_json::to_string(results)).transpose()?;
     print_table(&table, json)
 }
 

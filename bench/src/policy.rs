@@ -13,10 +13,10 @@ use shoal_learner::networks::initialise::small_output;
 use shoal_learner::networks::product::{Product, Transposed};
 
 use super::intervals::{self, Samples};
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::target::{Line, Target};
+use super::target::{Target, TargetRow};
 use super::temporary_run::TemporaryRun;
 
 const INTERVAL: Duration = Duration::from_millis(50);
@@ -33,7 +33,7 @@ const ATTEMPTS: usize = 10;
 
 /// The fields of `bench policy --json`.
 #[derive(Serialize)]
-pub(super) struct PolicyFigures {
+pub(super) struct PolicyResults {
     #[serde(rename = "method")]
     algorithm: String,
     actions_per_second_batch_1: f64,
@@ -62,7 +62,7 @@ pub(super) struct PolicyFigures {
 }
 
 /// Measures one of the [algorithms](super::algorithms), by default DDPG.
-pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<PolicyFigures> {
+pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<PolicyResults> {
     let temporary = TemporaryRun::with_algorithm(algorithm)?;
     let config = temporary.remove_directory()?;
     let (width, action_width) = (config.spec.observation.width(), config.spec.action.width());
@@ -128,7 +128,7 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
     let sizes = layout.layer_sizes();
     let flop: usize = sizes.map(|(i, o)| 2 * i * o * ENVIRONMENTS).sum();
     let share_of_limit = |calls_per_second: f64| calls_per_second * flop as f64 / 1e9 / limit.median();
-    Ok(PolicyFigures {
+    Ok(PolicyResults {
         algorithm: config.algorithm.name().into(),
         actions_per_second_batch_1: one,
         actions_per_second_batch_64: many * ENVIRONMENTS as f64,
@@ -190,8 +190,8 @@ fn read(numbers: &[f32]) {
     std::hint::black_box(sums);
 }
 
-impl Figures for PolicyFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
+impl StageResults for PolicyResults {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let line = |calls: &Samples, batch: usize, time: f64| {
             let unit = 1e3 / batch as f64;
             format!("{} thousand actions a second, {time:.1} µs a call", calls.show(unit, 0))
@@ -238,16 +238,16 @@ impl Figures for PolicyFigures {
         ]
     }
 
-    fn table(&self) -> Vec<Line> {
+    fn target_rows(&self) -> Vec<TargetRow> {
         vec![
-            Line {
+            TargetRow {
                 stage: "policy, one observation",
                 ours: format!("{:.1} µs", self.microseconds_per_call_batch_1),
                 limit: format!("{:.1} µs to read its weights", self.reading_microseconds),
                 share: Some(self.share_of_reading),
                 target: Target::unchecked("as fast as reading"),
             },
-            Line {
+            TargetRow {
                 stage: "policy, batch 64",
                 ours: format!("{:.0} thousand actions/s", self.actions_per_second_batch_64 / 1e3),
                 limit: format!("{:.0} GFLOP/s, its largest product", self.limit_gflops),

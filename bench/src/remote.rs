@@ -15,7 +15,7 @@ use self::cable::Cable;
 use self::hosts::{Network, RemoteRun};
 use self::model::{Bottleneck, Costs, PolicyAge, policy_age};
 use super::intervals::{self, Samples};
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::memory::Memory;
 use super::temporary_run::{TemporaryRun, UNDISTURBED};
 
@@ -78,21 +78,21 @@ const WARM_UP: f64 = 0.1;
 
 /// The fields of `bench remote --json`.
 #[derive(Serialize)]
-pub(super) struct RemoteFigures {
+pub(super) struct RemoteResults {
     chunk_rows: u32,
     window_chunks: u32,
     actors: u32,
     /// One host with `actors` actors, over the loopback device, without encryption.
-    loopback: LinkFigures,
+    loopback: LinkResults,
     /// The same over a virtual cable, with encryption; `None` where the machine makes no virtual cable.
-    cable: Option<LinkFigures>,
+    cable: Option<LinkResults>,
     /// The same over a cable of 1 Gbit/s.
-    gigabit: Option<LinkFigures>,
-    outages: Option<OutageFigures>,
-    many: ManyFigures,
-    most: ManyFigures,
+    gigabit: Option<LinkResults>,
+    outages: Option<OutageResults>,
+    many: ManyResults,
+    most: ManyResults,
     /// What a queueing model predicts, beside measurements.
-    model: Option<ModelFigures>,
+    model: Option<ModelResults>,
     /// Why there is no virtual cable.
     #[serde(skip)]
     no_cable: Option<String>,
@@ -101,7 +101,7 @@ pub(super) struct RemoteFigures {
 /// Actors that fill a chunk in a millisecond, on one host behind a cable of 100 Mbit/s; and what the model expects of
 /// 1,024 actors on 32 hosts with cables of 1 Gbit/s.
 #[derive(Serialize)]
-struct ModelFigures {
+struct ModelResults {
     rows: Vec<ModelRow>,
     relay_us: f64,
     gate_us: f64,
@@ -120,7 +120,7 @@ struct ModelRow {
 }
 
 #[derive(Serialize)]
-struct LinkFigures {
+struct LinkResults {
     rows_per_second: f64,
     /// Cores that the processes keep busy.
     gate_cores: f64,
@@ -132,7 +132,7 @@ struct LinkFigures {
 
 /// The cable is unplugged and plugged in again.
 #[derive(Serialize)]
-struct OutageFigures {
+struct OutageResults {
     count: usize,
     /// From plugging in to the next rows in the replay.
     median_s: f64,
@@ -141,7 +141,7 @@ struct OutageFigures {
 
 /// Many hosts and one gate, over the loopback device.
 #[derive(Serialize)]
-struct ManyFigures {
+struct ManyResults {
     hosts: u32,
     actors: u32,
     rows_per_second: f64,
@@ -154,14 +154,14 @@ struct ManyFigures {
     rejoined_s: f64,
 }
 
-pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteResults> {
     let [rates, outages, many, modelled] = SHARES.map(|share| budget.length.mul_f64(share));
     let loopback = measure_link(&Network::Loopback, rates, budget)?;
     let cables = || -> anyhow::Result<_> {
         let cable = |limit| Cable::new(limit).map(Network::Cable);
         Ok([cable(None)?, cable(Some(FAST_CABLE))?, cable(Some(SLOW_CABLE))?])
     };
-    let mut figures = RemoteFigures {
+    let mut results = RemoteResults {
         chunk_rows: CHUNK_ROWS,
         window_chunks: WINDOW,
         actors: ACTORS,
@@ -177,14 +177,14 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
     match cables() {
         Ok([unlimited, gigabit, slow]) => {
             let cable = measure_link(&unlimited, rates, budget)?;
-            figures.gigabit = Some(measure_link(&gigabit, rates, budget)?);
-            figures.outages = Some(measure_outages(&unlimited, outages, budget)?);
-            figures.model = Some(predict(&cable, &slow, modelled, budget)?);
-            figures.cable = Some(cable);
+            results.gigabit = Some(measure_link(&gigabit, rates, budget)?);
+            results.outages = Some(measure_outages(&unlimited, outages, budget)?);
+            results.model = Some(predict(&cable, &slow, modelled, budget)?);
+            results.cable = Some(cable);
         }
-        Err(why) => figures.no_cable = Some(format!("{why:#}")),
+        Err(why) => results.no_cable = Some(format!("{why:#}")),
     }
-    Ok(figures)
+    Ok(results)
 }
 
 /// A run whose learner makes no gradient steps.
@@ -206,7 +206,7 @@ fn temporary_run(actors: u32, window: u32) -> anyhow::Result<TemporaryRun> {
 }
 
 /// The rate of one host.
-fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<LinkFigures> {
+fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<LinkResults> {
     let temporary = temporary_run(ACTORS, WINDOW)?;
     RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
         run.send_for(length.mul_f64(WARM_UP))?;
@@ -231,7 +231,7 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
         let elapsed = begun.elapsed().as_secs_f64();
         let after: Vec<Duration> = busy()?;
         let cores = |i: usize| after[i].saturating_sub(before[i]).as_secs_f64() / elapsed;
-        Ok(LinkFigures {
+        Ok(LinkResults {
             rows_per_second: rates.median(),
             gate_cores: cores(0),
             relay_cores: cores(1),
@@ -242,7 +242,7 @@ fn measure_link(network: &Network, length: Duration, budget: &TimeBudget) -> any
 }
 
 /// Unplugs the cable several times, for [`OUTAGE_LENGTHS`] different times in turn.
-fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageFigures> {
+fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageResults> {
     let Network::Cable(cable) = network else {
         anyhow::bail!("only a cable can be unplugged");
     };
@@ -265,7 +265,7 @@ fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> 
             }
             returned.add(plugged.elapsed().as_secs_f64());
         }
-        Ok(OutageFigures {
+        Ok(OutageResults {
             count: returned.len(),
             median_s: returned.median(),
             longest_s: returned.greatest(),
@@ -276,11 +276,11 @@ fn measure_outages(network: &Network, length: Duration, budget: &TimeBudget) -> 
 /// Compares the model with measurements over a slow cable. The costs of relay, gate and learner were measured over the
 /// unlimited cable.
 fn predict(
-    unlimited: &LinkFigures,
+    unlimited: &LinkResults,
     slow: &Network,
     length: Duration,
     budget: &TimeBudget,
-) -> anyhow::Result<ModelFigures> {
+) -> anyhow::Result<ModelResults> {
     let chunks_per_second = unlimited.rows_per_second / f64::from(CHUNK_ROWS);
     let of_gigabit = f64::from(CHUNK_ROWS) / GIGABIT_ROWS;
     let mut costs = Costs {
@@ -312,7 +312,7 @@ fn predict(
         learner_link: of_gigabit,
         ..costs
     };
-    Ok(ModelFigures {
+    Ok(ModelResults {
         rows,
         relay_us: costs.relay * 1e6,
         gate_us: costs.gate * 1e6,
@@ -355,7 +355,7 @@ fn measure_many_hosts(
     (hosts, actors): (u32, u32),
     length: Duration,
     budget: &TimeBudget,
-) -> anyhow::Result<ManyFigures> {
+) -> anyhow::Result<ManyResults> {
     let with_own_service = hosts * actors <= ActorsConfig::MAX_ON_A_HOST;
     let first = if with_own_service {
         0
@@ -392,7 +392,7 @@ fn measure_many_hosts(
                 RETURN_TIMEOUT.as_secs()
             );
         }
-        Ok(ManyFigures {
+        Ok(ManyResults {
             hosts,
             actors: hosts * actors,
             rows_per_second: of_hosts.iter().sum::<u64>() as f64 / elapsed,
@@ -405,7 +405,7 @@ fn measure_many_hosts(
     })
 }
 
-impl ModelFigures {
+impl ModelResults {
     fn show_rows(&self) -> String {
         let one = |row: &ModelRow| {
             let ModelRow {
@@ -433,7 +433,7 @@ impl ModelFigures {
     }
 }
 
-impl ManyFigures {
+impl ManyResults {
     fn show(&self) -> String {
         format!(
             "{} with {} actors: {:.2} million rows a second, the slowest has {:.2} of the fastest",
@@ -455,7 +455,7 @@ impl ManyFigures {
     }
 }
 
-impl LinkFigures {
+impl LinkResults {
     fn show(&self) -> String {
         format!(
             "{} million rows a second; gate {:.2} cores, relay {:.2}",
@@ -466,10 +466,10 @@ impl LinkFigures {
     }
 }
 
-impl Figures for RemoteFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
+impl StageResults for RemoteResults {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let none = || self.no_cable.clone().unwrap_or_default();
-        let link = |link: &Option<LinkFigures>| link.as_ref().map_or_else(none, LinkFigures::show);
+        let link = |link: &Option<LinkResults>| link.as_ref().map_or_else(none, LinkResults::show);
         vec![
             ("one host, loopback, unencrypted", self.loopback.show()),
             ("one host, virtual cable, encrypted", link(&self.cable)),
@@ -483,7 +483,7 @@ impl Figures for RemoteFigures {
             (
                 "cable plugged in, to the next rows",
                 self.outages.as_ref().map_or_else(none, |outages| {
-                    let OutageFigures {
+                    let OutageResults {
                         count,
                         median_s,
                         longest_s,
@@ -497,11 +497,11 @@ impl Figures for RemoteFigures {
             ("their gate", self.most.show_gate()),
             (
                 "actors over 100 Mbit/s (expected)",
-                self.model.as_ref().map_or_else(none, ModelFigures::show_rows),
+                self.model.as_ref().map_or_else(none, ModelResults::show_rows),
             ),
             (
                 "expected of 1,024 over 1 Gbit/s",
-                self.model.as_ref().map_or_else(none, ModelFigures::show_many),
+                self.model.as_ref().map_or_else(none, ModelResults::show_many),
             ),
             (
                 "chunks",

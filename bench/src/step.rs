@@ -13,9 +13,9 @@ use shoal_common::role::Role;
 use shoal_run::child_process::ChildProcess;
 
 use super::cores::Cores;
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::spin;
-use super::target::{Line, Target};
+use super::target::{Target, TargetRow};
 use super::temporary_run::TemporaryRun;
 
 /// Time between two checks for an interruption.
@@ -33,7 +33,7 @@ const SPIN: f64 = 0.1;
 
 /// The fields of `bench step --json`.
 #[derive(Serialize)]
-pub(super) struct StepFigures {
+pub(super) struct StepResults {
     median_us: f64,
     p99_us: f64,
     least_us: f64,
@@ -47,7 +47,7 @@ pub(super) struct StepFigures {
     one_core_p99_us: f64,
 }
 
-pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepResults> {
     let temporary = TemporaryRun::new(&[])?;
     let mut spins = spin::times(budget.length.mul_f64(SPIN / 2.0));
     let [apart, together] = SHARES.map(|share| budget.length.mul_f64(share));
@@ -60,7 +60,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepFigures> {
     times.sort_unstable();
     on_one_core.sort_unstable();
     let microseconds = |quantile| quantile_of(&times, quantile);
-    Ok(StepFigures {
+    Ok(StepResults {
         median_us: microseconds(0.5),
         p99_us: microseconds(0.99),
         least_us: microseconds(0.0),
@@ -137,18 +137,18 @@ fn round_trips(
     }
 }
 
-impl Figures for StepFigures {
-    fn table(&self) -> Vec<Line> {
+impl StageResults for StepResults {
+    fn target_rows(&self) -> Vec<TargetRow> {
         let [apart, together] = [self.median_us, self.one_core_median_us];
         vec![
-            Line {
+            TargetRow {
                 stage: "environment step, two cores",
                 ours: format!("{apart:.2} µs"),
                 limit: format!("{:.2} µs, two threads that spin", self.spin_median_us),
                 share: Some(self.spin_median_us / apart),
                 target: Target::at_most(2.5, apart, "2.5 µs"),
             },
-            Line {
+            TargetRow {
                 stage: "environment step, one core",
                 ours: format!("{together:.2} µs"),
                 limit: String::new(),
@@ -158,7 +158,7 @@ impl Figures for StepFigures {
         ]
     }
 
-    fn lines(&self) -> Vec<(&'static str, String)> {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         vec![
             ("median", format!("{:.2} µs", self.median_us)),
             ("90 of 100 within", format!("{:.2} µs", self.p90_us)),

@@ -4,20 +4,20 @@ use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde_json::{Map, Value};
 
-use super::measurement::{Figures, TimeBudget, print_table};
-use super::target::Line;
+use super::measurement::{StageResults, TimeBudget, print_table};
+use super::target::TargetRow;
 use super::{actors, learner, policy, step, transitions, whole_run};
 
-/// The results of the stages by name, and the lines of the table.
+/// The results of the stages by name, and the rows of the table.
 struct All {
     stages: Map<String, Value>,
-    lines: Vec<Line>,
+    rows: Vec<TargetRow>,
 }
 
 impl All {
-    fn add(&mut self, stage: &str, figures: &impl Figures) -> anyhow::Result<()> {
-        self.stages.insert(stage.into(), serde_json::to_value(figures)?);
-        self.lines.extend(figures.table());
+    fn add(&mut self, stage: &str, results: &impl StageResults) -> anyhow::Result<()> {
+        self.stages.insert(stage.into(), serde_json::to_value(results)?);
+        self.rows.extend(results.target_rows());
         Ok(())
     }
 }
@@ -26,7 +26,7 @@ impl All {
 pub(super) fn measure_all(json: bool, budget: &TimeBudget) -> anyhow::Result<()> {
     let mut all = All {
         stages: Map::new(),
-        lines: Vec::new(),
+        rows: Vec::new(),
     };
     all.add("learner", &learner::measure(None, budget)?)?;
     all.add("transitions", &transitions::measure(budget)?)?;
@@ -34,17 +34,17 @@ pub(super) fn measure_all(json: bool, budget: &TimeBudget) -> anyhow::Result<()>
     all.add("policy", &policy::measure(None, budget)?)?;
     all.add("actors", &actors::measure(None, budget)?)?;
     all.add("run", &whole_run::measure(budget)?)?;
-    let All { mut stages, lines } = all;
+    let All { mut stages, rows } = all;
 
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
     table.set_header(["stage", "ours", "limit", "share", "target"]);
-    for line in &lines {
-        let share = line.share.map_or_else(String::new, |share| format!("{share:.2}"));
-        table.add_row([line.stage, &line.ours, &line.limit, &share, &line.target.show()]);
+    for row in &rows {
+        let share = row.share.map_or_else(String::new, |share| format!("{share:.2}"));
+        table.add_row([row.stage, &row.ours, &row.limit, &share, &row.target.show()]);
     }
     let json = if json {
-        stages.insert("table".into(), serde_json::to_value(&lines)?);
+        stages.insert("table".into(), serde_json::to_value(&rows)?);
         Some(Value::Object(stages).to_string())
     } else {
         None

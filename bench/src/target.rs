@@ -1,20 +1,20 @@
-//! What a figure is compared with: the machine's limit and a target.
+//! What a result is compared with: the machine's limit and a target.
 
 use serde::Serialize;
 
-/// A line of the table of `bench all`.
+/// A row of the table of `bench all`.
 #[derive(Debug, Serialize)]
-pub(super) struct Line {
+pub(super) struct TargetRow {
     pub(super) stage: &'static str,
     pub(super) ours: String,
     /// The machine's limit, measured in the same run; empty if there is none.
     pub(super) limit: String,
-    /// Our figure divided by the limit.
+    /// Our result divided by the limit.
     pub(super) share: Option<f64>,
     pub(super) target: Target,
 }
 
-/// The target of a figure.
+/// The target of a result.
 #[derive(Debug, Serialize)]
 pub(super) struct Target {
     text: &'static str,

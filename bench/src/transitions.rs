@@ -16,10 +16,10 @@ use shoal_learner::replay::Replay;
 use shoal_run::child_process::ChildProcess;
 
 use super::intervals::{self, Samples};
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::progress::wait_for_replay;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::target::{Line, Target};
+use super::target::{Target, TargetRow};
 use super::temporary_run::{TemporaryRun, UNDISTURBED, ddpg};
 
 const INTERVAL: Duration = Duration::from_millis(100);
@@ -33,7 +33,7 @@ const CHUNKS: usize = 64;
 
 /// The fields of `bench transitions --json`.
 #[derive(Serialize)]
-pub(super) struct TransitionFigures {
+pub(super) struct TransitionResults {
     rows_per_second: f64,
     chunk_rows: usize,
     /// Rows drawn at random from the replay and copied into minibatches, by one thread, while no process writes.
@@ -48,7 +48,7 @@ pub(super) struct TransitionFigures {
     sampled: Samples,
 }
 
-pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionResults> {
     let own = ["actors.chunk_steps=64", "replay.updates_per_step=0"];
     let temporary = TemporaryRun::new(&[&own[..], &UNDISTURBED].concat())?;
     let moved = temporary.with_role(Role::Learner, |domain, learner| {
@@ -56,7 +56,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> 
     })?;
     let replay = Replay::open(&temporary.run.replay_file(), &temporary.replay_layout())?;
     let sampled = sample(&replay, &temporary.config, budget)?;
-    Ok(TransitionFigures {
+    Ok(TransitionResults {
         rows_per_second: moved.median(),
         chunk_rows: temporary.config.chunk_rows(),
         sampled_rows_per_second: sampled.median(),
@@ -171,9 +171,9 @@ fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Resu
     Ok(results)
 }
 
-impl Figures for TransitionFigures {
-    fn table(&self) -> Vec<Line> {
-        let line = |stage, rows: f64, target| Line {
+impl StageResults for TransitionResults {
+    fn target_rows(&self) -> Vec<TargetRow> {
+        let row = |stage, rows: f64, target| TargetRow {
             stage,
             ours: format!("{:.1} million rows/s", rows / 1e6),
             limit: String::new(),
@@ -182,12 +182,12 @@ impl Figures for TransitionFigures {
         };
         let [moved, sampled] = [self.rows_per_second, self.sampled_rows_per_second];
         vec![
-            line(
+            row(
                 "transitions into the replay",
                 moved,
                 Target::at_least(5e6, moved, "5 million rows/s"),
             ),
-            line(
+            row(
                 "transitions sampled",
                 sampled,
                 Target::at_least(20e6, sampled, "20 million rows/s"),
@@ -195,7 +195,7 @@ impl Figures for TransitionFigures {
         ]
     }
 
-    fn lines(&self) -> Vec<(&'static str, String)> {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         vec![
             (
                 "into the committed replay",

@@ -10,9 +10,9 @@ use shoal_common::role::Role;
 
 use self::training::{Recovery, Startup, Training};
 use super::intervals::Samples;
-use super::measurement::{Figures, TimeBudget};
+use super::measurement::{StageResults, TimeBudget};
 use super::memory::Memory;
-use super::target::{Line, Target};
+use super::target::{Target, TargetRow};
 
 mod training;
 
@@ -30,7 +30,7 @@ const MEGABYTE: f64 = 1e6;
 
 /// The fields of `bench run --json`. Times are in seconds.
 #[derive(Serialize)]
-pub(super) struct RunFigures {
+pub(super) struct RunResults {
     starts: usize,
     /// From the launcher's start to the first heartbeat of every role.
     ready_seconds: Spread,
@@ -65,7 +65,7 @@ struct RoleMemory {
     memory: Memory,
 }
 
-pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RunFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RunResults> {
     let begun = Instant::now();
     let mut starts = Vec::new();
     loop {
@@ -81,7 +81,7 @@ pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RunFigures> {
         let measured = measured?;
         ended?;
         if let Some((recoveries, roles)) = measured {
-            return Ok(RunFigures::new(&starts, &recoveries, roles));
+            return Ok(RunResults::new(&starts, &recoveries, roles));
         }
     }
 }
@@ -116,7 +116,7 @@ fn recoveries_and_memory(
     Ok((recoveries, roles))
 }
 
-impl RunFigures {
+impl RunResults {
     fn new(starts: &[Startup], recoveries: &[Recovery], roles: Vec<RoleMemory>) -> Self {
         let of_starts = |seconds: fn(&Startup) -> Duration| Spread::of(starts.iter().map(seconds));
         Self {
@@ -152,9 +152,9 @@ impl Spread {
     }
 }
 
-impl Figures for RunFigures {
-    fn table(&self) -> Vec<Line> {
-        let seconds = |stage, spread: &Spread| Line {
+impl StageResults for RunResults {
+    fn target_rows(&self) -> Vec<TargetRow> {
+        let seconds = |stage, spread: &Spread| TargetRow {
             stage,
             ours: spread.show(),
             limit: String::new(),
@@ -170,7 +170,7 @@ impl Figures for RunFigures {
         vec![
             seconds("start to first update", &self.start_seconds),
             seconds("killed learner to next update", &self.recovery_seconds),
-            Line {
+            TargetRow {
                 stage: "memory of the largest role",
                 ours: format!("{:.1} MB", most as f64 / MEGABYTE),
                 limit: String::new(),
@@ -180,7 +180,7 @@ impl Figures for RunFigures {
         ]
     }
 
-    fn lines(&self) -> Vec<(&'static str, String)> {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let roles = self.roles.iter().map(|RoleMemory { role, index, memory }| {
             let megabytes = |bytes: u64| bytes as f64 / MEGABYTE;
             format!(

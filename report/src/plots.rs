@@ -96,31 +96,17 @@ fn episode(description: &Description, trajectory: &Trajectory, out: &Path) -> an
 
 #[cfg(test)]
 mod tests {
-    use shoal_common::policy_file::PolicyFile;
     use shoal_common::versioned_file::VersionedFile;
 
     use super::*;
     use shoal_run::evaluation::rollout::policy_layout;
     use shoal_run::plan::resolve_preset;
-    use shoal_run::testing::small;
+    use shoal_run::testing::{run_with_policy, small};
 
     /// The figures of a run with a policy, by name, and why there is no episode among them.
     fn drawn((config, parameters): (Config, Vec<f32>), said: Option<&Description>) -> (Vec<String>, Option<String>) {
         let parent = tempfile::tempdir().unwrap();
-        let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
-        std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
-        std::fs::create_dir(run_dir.checkpoints()).unwrap();
-        let fingerprint = policy_layout(&config).unwrap().fingerprint();
-        let policy = PolicyFile {
-            fingerprint,
-            version: 1,
-            env_steps: 1,
-            return_mean: 0.0,
-            return_std: 0.0,
-            episodes: 1,
-            parameters,
-        };
-        policy.write(&run_dir.best_policy()).unwrap();
+        let run_dir = run_with_policy(parent.path(), "run", &config, Some(parameters));
         let out = parent.path().join("pictures");
         std::fs::create_dir(&out).unwrap();
         if let Some(said) = said {

@@ -8,7 +8,7 @@ use shoal_report::figure::{self, CurvesOfSetting, DiagramAxes};
 
 use super::claim::{Claim, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
-use super::family::{Family, Policies, Results};
+use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 use super::result::SeedResult;
 
@@ -145,10 +145,10 @@ impl Family for CartPole {
     type Measurements = TrainingHistory;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<TrainingHistory> {
-        let episodes = policies.episodes()?;
+    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<TrainingHistory> {
+        let episodes = trained.episodes()?;
         let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
-        Ok(TrainingHistory::of(&returns, is_dead(policies)?))
+        Ok(TrainingHistory::of(&returns, is_dead(trained)?))
     }
 
     fn sections(results: &Results<TrainingHistory>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
@@ -215,17 +215,17 @@ The second hidden layer has only two units. If both are dead from some episode o
 observation, and nothing more is learned. Such seeds are counted like the others.";
 
 /// Whether the last policy has the same scores for many random states within the bounds of an episode.
-fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
+fn is_dead(trained: &TrainedRun) -> anyhow::Result<bool> {
     const STATES: usize = 200;
-    let Policy::Scored(mut scores) = policies.config.policy(STATES)? else {
+    let Policy::Scored(mut scores) = trained.config.policy(STATES)? else {
         return Ok(false);
     };
-    let mut numbers = stream(policies.config.run.seed, Purpose::Analysis, 0, 0);
+    let mut numbers = stream(trained.config.run.seed, Purpose::Analysis, 0, 0);
     let bounds: [f32; 4] = [2.4, 2.0, 0.2, 2.0];
     let states: Vec<f32> = (0..STATES)
         .flat_map(|_| bounds.map(|bound| numbers.random_range(-bound..bound)))
         .collect();
-    let mut each = scores.compute(&policies.last.parameters, &states);
+    let mut each = scores.compute(&trained.last.parameters, &states);
     let first: Option<Vec<f32>> = each.next().map(Into::into);
     Ok(first.is_none_or(|first| each.all(|scores| scores == first)))
 }

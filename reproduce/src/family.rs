@@ -30,14 +30,14 @@ pub(super) trait Family {
     const EXPERIMENTS: &'static [Experiment];
 
     /// Measures a run that has just reached the end of `stage`.
-    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Measurements>;
+    fn measure(trained: &TrainedRun, stage: &Stage) -> anyhow::Result<Self::Measurements>;
 
     /// Checks the thesis's claims and draws its figures, from stored results alone.
     fn sections(results: &Results<Self::Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
 }
 
-/// The policies of a run.
-pub(super) struct Policies {
+/// A trained run and its policies.
+pub(super) struct TrainedRun {
     pub(super) config: Config,
     /// The policy with the best evaluation.
     pub(super) best: PolicyFile,
@@ -46,7 +46,7 @@ pub(super) struct Policies {
     pub(super) run: RunDir,
 }
 
-impl Policies {
+impl TrainedRun {
     /// Opens a trained run, which must have these settings. An interrupted final evaluation is completed.
     fn open(folder: &Folder, experiment: &Experiment, seed: u64, settings: &RunSettings) -> anyhow::Result<Self> {
         let run = RunDir::open(&folder.run(experiment, seed))?;
@@ -139,16 +139,16 @@ fn store_result<F: Family>(
     length: Length,
     settings: &RunSettings,
 ) -> anyhow::Result<()> {
-    let policies = Policies::open(folder, experiment, seed, settings)?;
+    let trained = TrainedRun::open(folder, experiment, seed, settings)?;
     let evaluate = |policy: &PolicyFile| -> anyhow::Result<Policy> {
-        let config = &policies.config;
+        let config = &trained.config;
         let episodes = config.evaluation.final_episodes;
         Ok(Policy {
             steps: policy.env_steps,
             evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
         })
     };
-    let mut evaluations: Vec<Evaluation> = read_evaluations(&policies.run.evaluations())?
+    let mut evaluations: Vec<Evaluation> = read_evaluations(&trained.run.evaluations())?
         .into_iter()
         .map(|row| Evaluation {
             steps: row.env_steps,
@@ -158,11 +158,11 @@ fn store_result<F: Family>(
         .collect();
     evaluations.sort_by_key(|evaluation| evaluation.steps);
     let result = SeedResult {
-        header: Header::new(experiment, seed, length, &RunSettings::of(&policies.config)?),
+        header: Header::new(experiment, seed, length, &RunSettings::of(&trained.config)?),
         evaluations,
-        best: evaluate(&policies.best)?,
-        last: evaluate(&policies.last)?,
-        measurements: F::measure(&policies, stage)?,
+        best: evaluate(&trained.best)?,
+        last: evaluate(&trained.last)?,
+        measurements: F::measure(&trained, stage)?,
     };
     folder.add(experiment, stage, &result)
 }

@@ -12,7 +12,7 @@ use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::recorder::read_evaluations;
 
 use super::experiment::{Experiment, Length, Stage};
-use super::family::{Family, Policies, Results};
+use super::family::{Family, Results, TrainedRun};
 use super::report_section::{Figure, FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
 
@@ -143,12 +143,12 @@ impl Family for FrozenLake {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
-        let Policies { config, run, last, .. } = policies;
+    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+        let TrainedRun { config, run, last, .. } = trained;
         let layout = policy_layout(config)?;
         let mut steps = 0;
         // With one actor and one environment, an episode ends at the sum of all steps up to its own.
-        let ends: Vec<u64> = policies
+        let ends: Vec<u64> = trained
             .episodes()?
             .iter()
             .map(|episode| {

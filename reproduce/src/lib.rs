@@ -83,7 +83,7 @@ pub fn run(request: &Request) -> anyhow::Result<ReproductionEnd> {
         jobs: &jobs,
         settings: &settings,
     };
-    queue.run(request.jobs, write)
+    queue.run(request.parallel, write)
 }
 
 fn experiments() -> impl Iterator<Item = (&'static FamilyEntry, &'static Experiment)> {

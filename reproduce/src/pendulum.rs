@@ -7,7 +7,7 @@ use shoal_run::evaluation::rollout::Rollout;
 
 use super::claim::{Claim, spread};
 use super::experiment::{Experiment, Length, Stage};
-use super::family::{Family, Policies, Results};
+use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
 
@@ -52,12 +52,12 @@ impl Family for Pendulum {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
-        let run = |parameters| SwingUp::run(&mut Rollout::new(&policies.config, parameters)?);
-        let best = run(&policies.best.parameters)?;
+    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+        let run = |parameters| SwingUp::run(&mut Rollout::new(&trained.config, parameters)?);
+        let best = run(&trained.best.parameters)?;
         Ok(Measurements {
             best: best.measures(),
-            last: run(&policies.last.parameters)?.measures(),
+            last: run(&trained.last.parameters)?.measures(),
             swing_up: best.rounded(),
         })
     }

@@ -8,7 +8,7 @@ use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, Measures, NEAR_STA
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::experiment::{Experiment, Length, Stage};
-use super::family::{Family, Policies, Results};
+use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 
 /// The suffix of the stage after the additional training with r2.
@@ -82,11 +82,11 @@ impl Family for PointMass {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, stage: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, stage: &Stage) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let run = |parameters| TestRun::from_starts(&mut Rollout::new(&policies.config, parameters)?, &starts);
-        let best = run(&policies.best.parameters)?;
-        let last = run(&policies.last.parameters)?;
+        let run = |parameters| TestRun::from_starts(&mut Rollout::new(&trained.config, parameters)?, &starts);
+        let best = run(&trained.best.parameters)?;
+        let last = run(&trained.last.parameters)?;
         let shown = if stage.suffix == LONGER { NEAR_STARTS.len() } else { 0 };
         Ok(Measurements {
             best: best.iter().map(TestRun::measures).collect(),

@@ -14,7 +14,7 @@ use shoal_run::records::recorder::recorded;
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
 use super::request::{Job, JobName};
-use super::training::SeedProgress;
+use super::training::SeedState;
 
 /// The live line and its data.
 pub(super) struct ProgressDisplay<'a> {
@@ -61,7 +61,7 @@ impl<'a> ProgressDisplay<'a> {
             .into_iter()
             .filter_map(|job| {
                 // If the run cannot be read, the error is reported when the job starts.
-                let state = SeedProgress::of(&folder.run(job.experiment, job.seed)).unwrap_or(SeedProgress::Absent);
+                let state = SeedState::of(&folder.run(job.experiment, job.seed)).unwrap_or(SeedState::Absent);
                 let length = job.experiment.length(effort)?;
                 let begin = length.progress(state.progress()).0;
                 Some((job.name(), Due { length, begin }))

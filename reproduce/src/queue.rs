@@ -12,7 +12,7 @@ use super::folder::Folder;
 use super::progress::ProgressDisplay;
 use super::request::{Job, JobName, ReproductionEnd};
 use super::settings::RunSettings;
-use super::training::{SeedProgress, TrainingEnd, train};
+use super::training::{SeedState, TrainingEnd, train};
 
 /// The seeds that have no result yet, and where their results go.
 pub(super) struct SeedQueue<'a> {
@@ -103,7 +103,7 @@ impl SeedQueue<'_> {
                 continue;
             }
             let length = stage.length(self.effort);
-            let (done, total) = length.progress(SeedProgress::of(&run)?.progress());
+            let (done, total) = length.progress(SeedState::of(&run)?.progress());
             if matches!(length, Length::Steps(_)) && done > total {
                 bail!(
                     "{} has trained beyond {length} without a stored result: remove the run directory to start the \

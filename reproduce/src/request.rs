@@ -13,7 +13,7 @@ pub struct Request {
     /// Run the seeds 1 to this one; by default each experiment's own number of seeds.
     pub seeds: Option<u32>,
     /// Number of trainings that run at the same time.
-    pub jobs: usize,
+    pub parallel: usize,
     /// Full experiments or a quick look.
     pub effort: Effort,
     /// The directory of runs, results and figures.

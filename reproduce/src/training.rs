@@ -15,12 +15,12 @@ use super::experiment::{Effort, Experiment, Length, Progress};
 
 /// The state of a run directory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum SeedProgress {
+pub(super) enum SeedState {
     Absent,
     Started(Progress),
 }
 
-impl SeedProgress {
+impl SeedState {
     pub(super) fn of(run: &Path) -> anyhow::Result<Self> {
         if remove_interrupted_start(run)? {
             return Ok(Self::Absent);
@@ -29,10 +29,10 @@ impl SeedProgress {
         if directory.keeps_running()? {
             return Err(RunDirError::Busy(run.into()).into());
         }
-        let rest = status::saved_status(&directory.config()?, &directory)?;
+        let saved = status::saved_status(&directory.config()?, &directory)?;
         Ok(Self::Started(Progress {
-            steps: rest.env_steps,
-            episodes: rest.episodes,
+            steps: saved.env_steps,
+            episodes: saved.episodes,
         }))
     }
 
@@ -57,9 +57,9 @@ pub(super) fn train(
     interrupted: Interrupted<'_>,
 ) -> anyhow::Result<TrainingEnd> {
     let mut command = Command::new("/proc/self/exe");
-    match SeedProgress::of(run)? {
-        SeedProgress::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
-        SeedProgress::Absent => {
+    match SeedState::of(run)? {
+        SeedState::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
+        SeedState::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
                 .arg(run);
@@ -70,14 +70,14 @@ pub(super) fn train(
                 command.args(["--set", setting]);
             }
         }
-        SeedProgress::Started(_) => {
+        SeedState::Started(_) => {
             command.arg("resume").arg(run);
         }
     }
     command.args(length.arguments()).arg("--quiet");
-    let has_finished = || match SeedProgress::of(run)? {
-        SeedProgress::Started(progress) => has_ended(run, length, progress),
-        SeedProgress::Absent => Ok(false),
+    let has_finished = || match SeedState::of(run)? {
+        SeedState::Started(progress) => has_ended(run, length, progress),
+        SeedState::Absent => Ok(false),
     };
     // Tied to this process: if that is killed, the run ends, and the same command continues it.
     run_training(&mut tied(&command)?, interrupted, has_finished)
@@ -107,12 +107,9 @@ mod tests {
         let parent = tempfile::tempdir().unwrap();
         let run = parent.path().join("seed-1");
         std::fs::create_dir(&run).unwrap();
-        assert_eq!(SeedProgress::of(&run).unwrap(), SeedProgress::Absent);
+        assert_eq!(SeedState::of(&run).unwrap(), SeedState::Absent);
         std::fs::create_dir(&run).unwrap();
         std::fs::write(run.join("notes"), "").unwrap();
-        assert!(
-            SeedProgress::of(&run).is_err(),
-            "a directory with other files is an error"
-        );
+        assert!(SeedState::of(&run).is_err(), "a directory with other files is an error");
     }
 }

@@ -4,9 +4,12 @@
 
 use std::f64::consts::PI;
 use std::io::Write;
+use std::path::Path;
 
 use shoal_common::config::Config;
 use shoal_common::durable::seal;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::angle::wrap;
 use shoal_env_server::environment::make;
 
@@ -26,6 +29,26 @@ pub fn small(environment: &str) -> (Config, Vec<f32>) {
     let config = Config::from_table(table, "test").unwrap();
     let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
     (config, parameters)
+}
+
+/// A run directory as the launcher makes it, with a best policy if `parameters` are given.
+pub fn run_with_policy(parent: &Path, name: &str, config: &Config, parameters: Option<Vec<f32>>) -> RunDir {
+    let run = RunDir::create(&parent.join(name)).unwrap();
+    run.write_config(config).unwrap();
+    std::fs::create_dir(run.checkpoints()).unwrap();
+    if let Some(parameters) = parameters {
+        let policy = PolicyFile {
+            fingerprint: policy_layout(config).unwrap().fingerprint(),
+            version: 1,
+            env_steps: 1_000,
+            return_mean: 0.0,
+            return_std: 0.0,
+            episodes: 1,
+            parameters,
+        };
+        policy.write(&run.best_policy()).unwrap();
+    }
+    run
 }
 
 /// The file that the package `shoal` writes of a dataset with these rows: s, a, r, whether it was terminated, s', last.

@@ -64,7 +64,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     let request = Request {
         experiments: if all { Vec::new() } else { args.experiments.clone() },
         seeds: args.seeds,
-        jobs: args.jobs.map_or_else(trainings_for_all_cores, usize::from),
+        parallel: args.jobs.map_or_else(trainings_for_all_cores, usize::from),
         effort,
         folder,
         png: args.png,

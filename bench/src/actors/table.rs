@@ -1,13 +1,13 @@
 //! The results of `bench actors` as text for the user.
 
 use super::super::one_core::{OneCore, TARGET};
-use super::super::target::{Line, Target};
-use super::{ActorFigures, Bottleneck, Count, Figures, Rate, Scaling};
+use super::super::target::{Target, TargetRow};
+use super::{ActorResults, Bottleneck, Count, Rate, Scaling, StageResults};
 
 const THOUSAND: f64 = 1e3;
 
-impl Figures for ActorFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
+impl StageResults for ActorResults {
+    fn entries(&self) -> Vec<(&'static str, String)> {
         let Self {
             counts, scaling, costs, ..
         } = self;
@@ -48,7 +48,7 @@ impl Figures for ActorFigures {
         ]
     }
 
-    fn table(&self) -> Vec<Line> {
+    fn target_rows(&self) -> Vec<TargetRow> {
         let OneCore {
             pair_rows_per_second,
             inference_rows_per_second,
@@ -62,14 +62,14 @@ impl Figures for ActorFigures {
             .map(|count| count.collecting.rows_per_second)
             .fold(0.0, f64::max);
         vec![
-            Line {
+            TargetRow {
                 stage: "actor and server, one core",
                 ours: rows(pair_rows_per_second),
                 limit: format!("{}, the policy alone", rows(inference_rows_per_second)),
                 share: Some(share),
                 target: Target::at_least(TARGET, share, "0.8 of the limit"),
             },
-            Line {
+            TargetRow {
                 stage: "actors, all cores",
                 ours: rows(most),
                 limit: format!(
@@ -84,7 +84,7 @@ impl Figures for ActorFigures {
     }
 }
 
-impl ActorFigures {
+impl ActorResults {
     fn cores(&self) -> String {
         let crowded = self.counts.iter().find(|count| count.more_processes_than_cores);
         match crowded {

@@ -1,32 +1,16 @@
-use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::SignalSource;
-use shoal_run::evaluation::rollout::policy_layout;
-use shoal_run::testing::small;
+use shoal_env_server::frame::Image;
+use shoal_run::testing::{run_with_policy, small};
 
 use super::gif::tests::decoded;
+use super::paint::Painter;
+use super::writer::PAUSE;
 use super::*;
-
-fn directory(parent: &Path, config: &Config, parameters: &[f32]) -> RunDir {
-    let run = RunDir::create(&parent.join("run")).unwrap();
-    run.write_config(config).unwrap();
-    std::fs::create_dir(run.checkpoints()).unwrap();
-    let policy = PolicyFile {
-        fingerprint: policy_layout(config).unwrap().fingerprint(),
-        version: 1,
-        env_steps: 1_000,
-        return_mean: 0.0,
-        return_std: 0.0,
-        episodes: 1,
-        parameters: parameters.to_vec(),
-    };
-    policy.write(&run.best_policy()).unwrap();
-    run
-}
 
 fn filmed(environment: &str, episodes: u32) -> (Config, Vec<f32>, Vec<(Image, u16)>, Shown) {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small(environment);
-    let run = directory(parent.path(), &config, &parameters);
+    let run = run_with_policy(parent.path(), "run", &config, Some(parameters.clone()));
     let out = parent.path().join("film.gif");
     let request = Request {
         parameters: &parameters,
@@ -114,7 +98,7 @@ fn every_builtin_environment_draws_itself_and_an_action_shows() {
 fn a_film_that_fails_leaves_no_file() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"pendulum\"");
-    let run = directory(parent.path(), &config, &parameters);
+    let run = run_with_policy(parent.path(), "run", &config, Some(parameters.clone()));
     let out = parent.path().join("film.gif");
     let request = Request {
         parameters: &parameters[1..],

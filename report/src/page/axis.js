@@ -66,7 +66,7 @@ function nearest(numbers, value) {
 }
 
 /** Diagrams that share an x axis and are zoomed together. */
-class Link {
+class SharedAxis {
   constructor() {
     this.members = [];
     this.shown = null;

@@ -7,10 +7,10 @@ const DESCRIBED = 8;
 const LONG_LEGEND = 12;
 
 /**
- * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`; optionally `marks`, `height`, `line` (a
- * target value), `smoothing` (the share of the axis over which a moving mean is drawn; 0 for none). A series has `name`,
- * `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin, fine, thick). A mark has
- * `x`, `kind` and `text`.
+ * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `sharedAxis`, `series`; optionally `marks`, `height`, `line`
+ * (a target value), `smoothing` (the share of the axis over which a moving mean is drawn; 0 for none). A series has
+ * `name`, `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin, fine, thick). A
+ * mark has `x`, `kind` and `text`.
  */
 class Chart {
   constructor(options) {
@@ -33,7 +33,7 @@ class Chart {
         onpointerup: (event) => this.release(event),
         onpointercancel: () => this.leave(),
         onpointerleave: () => this.leave(),
-        ondblclick: () => this.link.show(null),
+        ondblclick: () => this.sharedAxis.show(null),
         onwheel: (event) => this.wheel(event),
         onblur: () => this.leave(),
       },
@@ -53,16 +53,16 @@ class Chart {
         html(
           "span",
           { class: "tools" },
-          button("−", "zoom out", () => this.link.zoom(2)),
-          button("+", "zoom in", () => this.link.zoom(0.5)),
-          button("All", "show all", () => this.link.show(null)),
+          button("−", "zoom out", () => this.sharedAxis.zoom(2)),
+          button("+", "zoom in", () => this.sharedAxis.zoom(0.5)),
+          button("All", "show all", () => this.sharedAxis.show(null)),
         ),
       ),
       this.plot,
       this.legend(),
       this.announcement,
     );
-    this.link.members.push(this);
+    this.sharedAxis.members.push(this);
     new ResizeObserver(() => this.draw()).observe(this.plot);
   }
 
@@ -116,7 +116,7 @@ class Chart {
     const width = this.plot.clientWidth;
     if (!width) return;
     const { height } = this;
-    const domain = this.link.domain;
+    const domain = this.sharedAxis.domain;
     this.x = scale(domain, [MARGIN.left, width - MARGIN.right]);
     const visible = this.shown().flatMap(({ x, y, low, high }) =>
       [y, low, high].filter(Boolean).flatMap((values) => values.filter((_, i) => x[i] >= domain[0] && x[i] <= domain[1])),
@@ -147,7 +147,7 @@ class Chart {
   axes(domain, range, width) {
     const { height, x, y } = this;
     const bottom = height - MARGIN.bottom;
-    const across = this.axis.scale(this.link.whole[1]);
+    const across = this.axis.scale(this.sharedAxis.whole[1]);
     const part = svg("g", { class: "axes" });
     for (const value of ticks(range[0], range[1], 5)) {
       part.append(svg("line", { x1: MARGIN.left, x2: width - MARGIN.right, y1: y(value), y2: y(value) }));
@@ -174,7 +174,7 @@ class Chart {
 
   /** The moving mean of a curve, over the smoothing's share of the whole axis. */
   means(series) {
-    const [low, high] = this.link.whole;
+    const [low, high] = this.sharedAxis.whole;
     return movingMean(series, this.smoothing * (high - low));
   }
 
@@ -271,7 +271,7 @@ class Chart {
     const left = this.place(event)[0];
     const from = this.from;
     this.from = undefined;
-    if (from !== undefined && Math.abs(left - from) > 8) this.link.show([this.x.inverse(from), this.x.inverse(left)]);
+    if (from !== undefined && Math.abs(left - from) > 8) this.sharedAxis.show([this.x.inverse(from), this.x.inverse(left)]);
     else this.point(event);
   }
 
@@ -284,20 +284,20 @@ class Chart {
   wheel(event) {
     if (!event.ctrlKey) return;
     event.preventDefault();
-    this.link.zoom(event.deltaY > 0 ? 1.25 : 0.8, this.x.inverse(this.place(event)[0]));
+    this.sharedAxis.zoom(event.deltaY > 0 ? 1.25 : 0.8, this.x.inverse(this.place(event)[0]));
   }
 
   key(event) {
-    const [low, high] = this.link.domain;
+    const [low, high] = this.sharedAxis.domain;
     const actions = {
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
-      "+": () => this.link.zoom(0.5, this.cursor),
-      "-": () => this.link.zoom(2, this.cursor),
-      0: () => this.link.show(null),
+      "+": () => this.sharedAxis.zoom(0.5, this.cursor),
+      "-": () => this.sharedAxis.zoom(2, this.cursor),
+      0: () => this.sharedAxis.show(null),
       Escape: () => this.leave(),
-      PageUp: () => this.link.move(-0.5),
-      PageDown: () => this.link.move(0.5),
+      PageUp: () => this.sharedAxis.move(-0.5),
+      PageDown: () => this.sharedAxis.move(0.5),
     };
     const action = actions[event.key];
     if (!action || !(high > low) || event.ctrlKey || event.altKey || event.metaKey) return;
@@ -307,7 +307,7 @@ class Chart {
 
   /** Moves the pointer to the next x value of a shown curve. */
   step(direction) {
-    const [low, high] = this.link.domain;
+    const [low, high] = this.sharedAxis.domain;
     const from = this.cursor ?? (direction > 0 ? low - 1 : high + 1);
     const least = (high - low) / 200;
     const places = this.shown().flatMap(({ x }) => x).filter((x) => x >= low && x <= high && (x - from) * direction > (this.cursor === null ? 0 : least));

@@ -9,7 +9,7 @@ use super::settings::{Setting, in_common};
 use crate::figure::quantile;
 
 /// Number of x values at which repetitions are compared.
-const PLACES: usize = 200;
+const X_VALUES: usize = 200;
 
 /// At most this many differing settings are named in the label of a set.
 const LABEL_SETTINGS: usize = 3;
@@ -152,8 +152,8 @@ fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
         median: Vec::new(),
         high: Vec::new(),
     };
-    for place in 0..PLACES {
-        let x = from + (to - from) * place as f64 / (PLACES - 1) as f64;
+    for i in 0..X_VALUES {
+        let x = from + (to - from) * i as f64 / (X_VALUES - 1) as f64;
         let mut values: Vec<f64> = curves.iter().map(|curve| at(curve, x)).collect();
         values.sort_by(f64::total_cmp);
         spread.x.push(short(x));
@@ -170,7 +170,7 @@ fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
 
 /// The curve's value at `x`, interpolated linearly.
 fn at(curve: &[(f64, f64)], x: f64) -> f64 {
-    let after = curve.partition_point(|(place, _)| *place <= x).min(curve.len() - 1);
+    let after = curve.partition_point(|(before, _)| *before <= x).min(curve.len() - 1);
     let (left, right) = (curve[after.saturating_sub(1)], curve[after]);
     if right.0 <= left.0 {
         return right.1;
@@ -188,13 +188,13 @@ mod tests {
         let long = vec![(0.0, 0.0), (100.0, 100.0), (200.0, 0.0)];
         let late = vec![(50.0, 10.0), (100.0, 10.0)];
         let spread = super::spread(&[long.clone(), late.clone()]).unwrap();
-        assert_eq!((spread.x[0], spread.x[PLACES - 1]), (50.0, 100.0));
+        assert_eq!((spread.x[0], spread.x[X_VALUES - 1]), (50.0, 100.0));
         assert_eq!((spread.low[0], spread.median[0], spread.high[0]), (10.0, 30.0, 50.0));
         assert_eq!(
             (
-                spread.low[PLACES - 1],
-                spread.median[PLACES - 1],
-                spread.high[PLACES - 1]
+                spread.low[X_VALUES - 1],
+                spread.median[X_VALUES - 1],
+                spread.high[X_VALUES - 1]
             ),
             (10.0, 55.0, 100.0)
         );

@@ -88,15 +88,15 @@ pub(super) fn downsample(values: &[f64], most: usize) -> Vec<usize> {
         return (0..values.len()).collect();
     }
     let last = values.len() - 1;
-    let mut places = vec![0, last];
+    let mut indices = vec![0, last];
     for part in parts(values.len(), (most / 2).max(2) - 1) {
         let by_value = |a: &usize, b: &usize| values[*a].total_cmp(&values[*b]);
-        places.extend(part.clone().min_by(by_value));
-        places.extend(part.max_by(by_value));
+        indices.extend(part.clone().min_by(by_value));
+        indices.extend(part.max_by(by_value));
     }
-    places.sort_unstable();
-    places.dedup();
-    places
+    indices.sort_unstable();
+    indices.dedup();
+    indices
 }
 
 #[cfg(test)]
@@ -124,12 +124,12 @@ mod tests {
             values in prop::collection::vec(-1e9..1e9_f64, 1..300),
             most in 4..100_usize,
         ) {
-            let places = downsample(&values, most);
-            prop_assert!(places.len() <= most.max(values.len().min(most)), "{} of {most}", places.len());
-            prop_assert!(places.windows(2).all(|pair| pair[0] < pair[1]));
-            prop_assert_eq!((places[0], places[places.len() - 1]), (0, values.len() - 1));
+            let indices = downsample(&values, most);
+            prop_assert!(indices.len() <= most.max(values.len().min(most)), "{} of {most}", indices.len());
+            prop_assert!(indices.windows(2).all(|pair| pair[0] < pair[1]));
+            prop_assert_eq!((indices[0], indices[indices.len() - 1]), (0, values.len() - 1));
             let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            prop_assert!(places.iter().any(|place| values[*place] == greatest));
+            prop_assert!(indices.iter().any(|i| values[*i] == greatest));
         }
 
         #[test]

@@ -156,7 +156,7 @@ function returns(comparison, axis, smoothing) {
     }
   });
   const marks = all.length <= COLOURS ? all.flatMap((i) => named(runs[i], changesOf(runs[i], axis))) : [];
-  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, marks, height: 340, smoothing });
+  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, sharedAxis: new SharedAxis(), series, marks, height: 340, smoothing });
 }
 
 /** Marks of a run, which say whose they are where there are several runs. */
@@ -207,7 +207,7 @@ function explored(comparison, axis, smoothing) {
   const returns = ({ exploration }) => ({ x: axis === STEPS ? exploration.steps : exploration.time, y: exploration.mean });
   const series = perRun(returns, comparison.sets.flatMap((set) => set.runs));
   const title = `Return while exploring, ${comparison.environment}`;
-  return series.length ? [new Chart({ title, unit: "", axis, link: new Link(), series, height: 240, smoothing })] : [];
+  return series.length ? [new Chart({ title, unit: "", axis, sharedAxis: new SharedAxis(), series, height: 240, smoothing })] : [];
 }
 
 function episodes() {
@@ -216,14 +216,14 @@ function episodes() {
 }
 
 function time() {
-  const link = new Link();
-  const parts = runs.filter((run) => run.incidents?.rows.length).map((run) => new Timeline(run, link, several).element);
+  const sharedAxis = new SharedAxis();
+  const parts = runs.filter((run) => run.incidents?.rows.length).map((run) => new Timeline(run, sharedAxis, several).element);
   parts.push(...remarks((run) => (run.incidents ? null : "This run was made by an older version, which recorded no incidents.")));
   parts.push(...remarks((run) => (run.incidents?.rows.length === 0 ? "No incidents were recorded." : null)));
   const marks = runs.length <= COLOURS ? runs.flatMap((run) => named(run, [...marksOf(run), ...changesOf(run, TIME)])) : [];
   const chart = (title, key, more = {}) => {
     const series = perRun(({ learner }) => ({ x: learner.time, y: learner[key] }));
-    if (series.length) parts.push(new Chart({ title, axis: TIME, link, series, marks, height: 220, unit: "", ...more }).element);
+    if (series.length) parts.push(new Chart({ title, axis: TIME, sharedAxis, series, marks, height: 220, unit: "", ...more }).element);
   };
   const configured = [...new Set(runs.map((run) => run.updates_per_step))];
   chart("Ratio: updates per step after the warm-up", "ratio", configured.length === 1 ? { line: configured[0] } : {});

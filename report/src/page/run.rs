@@ -214,18 +214,18 @@ impl EvaluationPoint {
 impl Curve {
     fn of_evaluations(rows: &[EvaluationRecord], points: usize) -> Self {
         let means: Vec<f64> = rows.iter().map(|row| row.return_mean).collect();
-        let places = downsample(&means, points);
+        let indices = downsample(&means, points);
         let (mut sums, mut counts) = (Vec::new(), Vec::new());
-        if places.len() < rows.len() {
+        if indices.len() < rows.len() {
             let mut from = 0;
-            for place in &places {
-                let since = means[from..=*place].iter().copied().filter(|mean| mean.is_finite());
+            for i in &indices {
+                let since = means[from..=*i].iter().copied().filter(|mean| mean.is_finite());
                 counts.push(since.clone().count());
                 sums.push(short(since.sum()));
-                from = place + 1;
+                from = i + 1;
             }
         }
-        let shown: Vec<&EvaluationRecord> = places.into_iter().map(|i| &rows[i]).collect();
+        let shown: Vec<&EvaluationRecord> = indices.into_iter().map(|i| &rows[i]).collect();
         Self {
             sums,
             counts,

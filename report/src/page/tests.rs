@@ -1,33 +1,12 @@
 use shoal_common::config::Config;
-use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::{make, names};
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::outcome::{RunOutcome, RunState};
 use shoal_run::records::recorder::IncidentKind;
-use shoal_run::testing::small;
+use shoal_run::testing::{run_with_policy, small};
 
 use super::numbers::POINTS;
 use super::*;
-
-/// A run directory as the launcher makes it, with a best policy if `parameters` are given.
-fn directory(parent: &std::path::Path, name: &str, config: &Config, parameters: Option<Vec<f32>>) -> RunDir {
-    let run = RunDir::create(&parent.join(name)).unwrap();
-    run.write_config(config).unwrap();
-    std::fs::create_dir(run.checkpoints()).unwrap();
-    if let Some(parameters) = parameters {
-        let policy = PolicyFile {
-            fingerprint: policy_layout(config).unwrap().fingerprint(),
-            version: 1,
-            env_steps: 1_000,
-            return_mean: 0.0,
-            return_std: 0.0,
-            episodes: 1,
-            parameters,
-        };
-        policy.write(&run.best_policy()).unwrap();
-    }
-    run
-}
 
 /// The data that the page's script reads.
 fn data(page: &str) -> serde_json::Value {
@@ -61,7 +40,7 @@ fn episodes_of_every_environment_can_be_played() {
     for (i, name) in names().enumerate() {
         let config = configuration(name);
         let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
-        let run = directory(parent.path(), &format!("run-{i}"), &config, Some(parameters));
+        let run = run_with_policy(parent.path(), &format!("run-{i}"), &config, Some(parameters));
         let data = data(&gather(&[run], None).unwrap().page().unwrap());
         let played = &data["runs"][0]["played"];
         assert_eq!(played["why_not"], serde_json::Value::Null, "{name}");
@@ -86,12 +65,12 @@ fn episodes_of_every_environment_can_be_played() {
 fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     let parent = tempfile::tempdir().unwrap();
     let (mut config, parameters) = small("name = \"pendulum\"");
-    let begun = directory(parent.path(), "begun", &config, None);
-    let damaged = directory(parent.path(), "damaged", &config, None);
+    let begun = run_with_policy(parent.path(), "begun", &config, None);
+    let damaged = run_with_policy(parent.path(), "damaged", &config, None);
     std::fs::write(damaged.best_policy(), "no policy").unwrap();
     config.environment.name = "walker".into();
     config.environment.server = vec!["no-such-program".into()];
-    let served = directory(parent.path(), "served", &config, Some(parameters));
+    let served = run_with_policy(parent.path(), "served", &config, Some(parameters));
     let report = gather(&[begun, damaged, served], None).unwrap();
     let reasons = report.runs_without_episodes();
     assert_eq!(reasons.len(), 3);
@@ -118,7 +97,7 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
 fn a_run_has_finished_although_the_last_report_of_its_learner_was_lost() {
     let parent = tempfile::tempdir().unwrap();
     let (config, _) = small("name = \"pendulum\"");
-    let run = directory(parent.path(), "run", &config, None);
+    let run = run_with_policy(parent.path(), "run", &config, None);
     let steps = config.run.steps;
     let learner = format!(
         "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,env_steps_per_second,ratio\n\
@@ -140,7 +119,7 @@ fn run_names_cannot_inject_markup_and_the_page_loads_nothing() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"pendulum\"");
     let name = "</script><script>alert(1)<!-- {{script}}";
-    let run = directory(parent.path(), &name.replace('/', "∕"), &config, Some(parameters));
+    let run = run_with_policy(parent.path(), &name.replace('/', "∕"), &config, Some(parameters));
     let mut report = gather(&[run], None).unwrap();
     report.runs[0].name = name.into();
     let page = report.page().unwrap();
@@ -162,7 +141,7 @@ fn run_names_cannot_inject_markup_and_the_page_loads_nothing() {
 fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"point-mass\"\nreward = \"r3\"");
-    let run = directory(parent.path(), "long", &config, Some(parameters));
+    let run = run_with_policy(parent.path(), "long", &config, Some(parameters));
     let mut evaluations =
         String::from("wall_seconds,env_steps,updates,policy_version,return_mean,return_std,episodes,best\n");
     let mut learner = String::from(
@@ -237,7 +216,7 @@ fn many_runs_share_the_points_and_episodes() {
 fn a_damaged_record_is_refused_with_one_line_that_names_the_file() {
     let parent = tempfile::tempdir().unwrap();
     let (config, _) = small("name = \"pendulum\"");
-    let run = directory(parent.path(), "run", &config, None);
+    let run = run_with_policy(parent.path(), "run", &config, None);
     std::fs::write(run.incidents(), "wall_seconds,env_steps\nwhen,3\n").unwrap();
     let error = format!("{:#}", gather(&[run], None).unwrap_err());
     assert!(

@@ -45,9 +45,9 @@ function marksOf(run) {
 }
 
 class Timeline {
-  constructor(run, link, named) {
+  constructor(run, sharedAxis, named) {
     this.run = run;
-    this.link = link;
+    this.sharedAxis = sharedAxis;
     const { rows } = run.incidents;
     this.lanes = ROLES.filter(([role]) => rows.some((row) => row.role === role));
     this.height = this.lanes.length * 44 + 44;
@@ -65,7 +65,7 @@ class Timeline {
       html("div", { class: "keys" }, key),
       this.table(),
     );
-    link.members.push(this);
+    sharedAxis.members.push(this);
     new ResizeObserver(() => this.draw()).observe(this.plot);
   }
 
@@ -89,9 +89,9 @@ class Timeline {
   draw() {
     const width = this.plot.clientWidth;
     if (!width) return;
-    const domain = this.link.domain;
+    const domain = this.sharedAxis.domain;
     const x = scale(domain, [MARGIN.left, width - MARGIN.right]);
-    const across = TIME.scale(this.link.whole[1]);
+    const across = TIME.scale(this.sharedAxis.whole[1]);
     set(this.picture, { viewBox: `0 0 ${width} ${this.height}`, width, height: this.height });
     const part = svg("g", { class: "axes" });
     const signs = svg("g", {});

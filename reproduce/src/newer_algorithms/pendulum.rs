@@ -6,7 +6,7 @@ use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, spread};
 use super::super::experiment::{Experiment, Stage};
-use super::super::family::{Family, Policies, Results};
+use super::super::family::{Family, Results, TrainedRun};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
 use super::{experiment, learning_curves, stage};
@@ -59,8 +59,8 @@ impl Family for PendulumAlgorithms {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
-        let best = SwingUp::run(&mut Rollout::new(&policies.config, &policies.best.parameters)?)?;
+    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+        let best = SwingUp::run(&mut Rollout::new(&trained.config, &trained.best.parameters)?)?;
         Ok(Measurements { best: best.measures() })
     }
 

@@ -8,7 +8,7 @@ use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, spread};
 use super::super::experiment::{Experiment, Stage};
-use super::super::family::{Family, Policies, Results};
+use super::super::family::{Family, Results, TrainedRun};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
 use super::{experiment, learning_curves, stage};
@@ -79,9 +79,9 @@ impl Family for PointMassAlgorithms {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(policies: &Policies, _: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let test_runs = TestRun::from_starts(&mut Rollout::new(&policies.config, &policies.best.parameters)?, &starts)?;
+        let test_runs = TestRun::from_starts(&mut Rollout::new(&trained.config, &trained.best.parameters)?, &starts)?;
         Ok(Measurements {
             best: test_runs.iter().map(TestRun::measures).collect(),
         })
