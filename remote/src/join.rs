@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -56,6 +56,14 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct GateConnection(Session);
 
+/// Why a [`LeaseKeeper`] ends.
+#[derive(Clone, Copy, Debug)]
+enum KeeperEnd {
+    /// The relay sends the reports from here on.
+    RelayReports,
+    HostLeaves,
+}
+
 /// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own. If it
 /// is dropped, the host leaves and its actors are free.
 #[derive(Debug)]
@@ -63,8 +71,8 @@ pub struct LeaseKeeper {
     /// `None` if nobody waits for its end.
     thread: Option<JoinHandle<()>>,
     run_is_over: Arc<AtomicBool>,
-    /// Ends the thread; true if the host leaves.
-    end: Sender<bool>,
+    /// Ends the thread.
+    end: Sender<KeeperEnd>,
 }
 
 impl LeaseKeeper {
@@ -76,53 +84,7 @@ impl LeaseKeeper {
         let (end, ended) = channel();
         let run_is_over = Arc::new(AtomicBool::new(false));
         let is_over = Arc::clone(&run_is_over);
-        let has_heard = Arc::clone(&run_is_over);
-        let keep = move || {
-            let key = network::reports(&run_id, &host.to_string());
-            let hear = move |acknowledgement: &[u8]| {
-                if Acknowledgement::decode(acknowledgement).is_ok_and(|news| news.phase == RunPhase::Over) {
-                    has_heard.store(true, Ordering::Relaxed);
-                }
-            };
-            // If this fails, the host learns of the run's end only from its relay.
-            let _subscriber = connection
-                .0
-                .declare_subscriber(network::acknowledgements(&run_id, host))
-                .callback(move |sample| hear(&sample.payload().to_bytes()))
-                .wait();
-            let send = |number, leaving| {
-                let report = HostReport::without_processes(
-                    host,
-                    ReportNumber {
-                        relay: 0,
-                        report: number,
-                    },
-                    leaving,
-                );
-                if let Ok(bytes) = report.encode() {
-                    // If it is lost, the next one may arrive; without any, the host loses its actors after a while.
-                    let _ = connection.0.put(&key, bytes).wait();
-                }
-            };
-            // The numbers of the relay's reports are greater.
-            for number in 1.. {
-                send(number, false);
-                match ended.recv_timeout(REPORT_INTERVAL) {
-                    // So that the gate need not wait for this host.
-                    Err(RecvTimeoutError::Timeout) if is_over.load(Ordering::Relaxed) => {
-                        send(number + 1, true);
-                        break;
-                    }
-                    Err(RecvTimeoutError::Timeout) => {}
-                    Ok(false) | Err(RecvTimeoutError::Disconnected) => break,
-                    Ok(true) => {
-                        send(number + 1, true);
-                        break;
-                    }
-                }
-            }
-            let _ = connection.0.close().wait();
-        };
+        let keep = move || report_until(&connection.0, &run_id, host, &is_over, &ended);
         let thread = std::thread::Builder::new().name("lease".into()).spawn(keep)?;
         let thread = Some(thread);
         Ok(Self {
@@ -140,7 +102,7 @@ impl LeaseKeeper {
 
     /// Ends the reports, because the relay sends them from now on. The connection may take a while to close.
     pub fn end(mut self) {
-        let _ = self.end.send(false);
+        let _ = self.end.send(KeeperEnd::RelayReports);
         self.thread = None;
     }
 }
@@ -148,11 +110,65 @@ impl LeaseKeeper {
 impl Drop for LeaseKeeper {
     fn drop(&mut self) {
         // After `end` nobody reads it.
-        let _ = self.end.send(true);
+        let _ = self.end.send(KeeperEnd::HostLeaves);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
     }
+}
+
+/// Sends reports until `end`, or until the gate says that the run is over, and then closes the connection.
+fn report_until(
+    connection: &Session,
+    run_id: &str,
+    host: u64,
+    run_is_over: &Arc<AtomicBool>,
+    end: &Receiver<KeeperEnd>,
+) {
+    let key = network::reports(run_id, &host.to_string());
+    let has_heard = Arc::clone(run_is_over);
+    let hear = move |acknowledgement: &[u8]| {
+        if Acknowledgement::decode(acknowledgement).is_ok_and(|news| news.phase == RunPhase::Over) {
+            has_heard.store(true, Ordering::Relaxed);
+        }
+    };
+    // If this fails, the host learns of the run's end only from its relay.
+    let _subscriber = connection
+        .declare_subscriber(network::acknowledgements(run_id, host))
+        .callback(move |sample| hear(&sample.payload().to_bytes()))
+        .wait();
+    let send = |number, leaving| {
+        let report = HostReport::without_processes(
+            host,
+            ReportNumber {
+                relay: 0,
+                report: number,
+            },
+            leaving,
+        );
+        if let Ok(bytes) = report.encode() {
+            // If it is lost, the next one may arrive; without any, the host loses its actors after a while.
+            let _ = connection.put(&key, bytes).wait();
+        }
+    };
+    // The numbers of the relay's reports are greater.
+    for number in 1.. {
+        send(number, false);
+        match end.recv_timeout(REPORT_INTERVAL) {
+            // So that the gate need not wait for this host.
+            Err(RecvTimeoutError::Timeout) if run_is_over.load(Ordering::Relaxed) => {
+                send(number + 1, true);
+                break;
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Ok(KeeperEnd::RelayReports) | Err(RecvTimeoutError::Disconnected) => break,
+            Ok(KeeperEnd::HostLeaves) => {
+                send(number + 1, true);
+                break;
+            }
+        }
+    }
+    let _ = connection.close().wait();
 }
 
 /// Asks the gate at this endpoint to admit this host. Asks again until there is an answer, `timeout` is over or `stop`

@@ -30,8 +30,8 @@ use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_I
 use crate::requests::LauncherRequests;
 use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
 use crate::wire::{
-    Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, ReportNumber,
-    RunPhase, WireChunk, WireError, WirePolicy, cores, id_of, vector_instructions,
+    Acknowledgement, Admission, Hello, HostReport, Message, PolicyId, PolicyRequest, RemoteEpisode, RemoteRole,
+    ReportNumber, RunPhase, WireChunk, WireError, WirePolicy, cores, id_of, vector_instructions,
 };
 
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
@@ -496,7 +496,7 @@ impl<'a> Relay<'a> {
                 .insert(PolicyPublisher::open(self.domain, policy.parameters.len())?),
         };
         publisher.publish(&policy.parameters, policy.header)?;
-        self.newest_policy.set(policy.header.incarnation, policy.header.version);
+        self.newest_policy.set(PolicyId::from(&policy.header));
         self.heartbeat.set_policy_version(policy.header.version);
         self.actors.values().for_each(|actor| actor.notifier.notify());
         Ok(())
@@ -574,7 +574,7 @@ impl<'a> Relay<'a> {
             round_trip_us: self.round_trip.map(|trip| trip.as_micros() as u64),
             leaving,
             resent: self.actors.values().map(|actor| actor.uncommitted.resent()).sum(),
-            policy_version: self.newest_policy.get().map_or(0, |(_, version)| version),
+            policy_version: self.newest_policy.get().map_or(0, |policy| policy.version),
             roles: self.roles.values().map(|(_, role)| *role).collect(),
             episodes,
         };
@@ -667,17 +667,17 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
     Ok(sender)
 }
 
-/// Learner's incarnation and version of the newest policy of this host; `None` before the first.
+/// The newest policy of this host; `None` before the first.
 #[derive(Clone, Debug, Default)]
-struct NewestPolicy(Arc<Mutex<Option<(u64, u64)>>>);
+struct NewestPolicy(Arc<Mutex<Option<PolicyId>>>);
 
 impl NewestPolicy {
-    fn get(&self) -> Option<(u64, u64)> {
+    fn get(&self) -> Option<PolicyId> {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn set(&self, incarnation: u64, version: u64) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((incarnation, version));
+    fn set(&self, id: PolicyId) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(id);
     }
 }
 

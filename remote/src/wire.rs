@@ -163,13 +163,31 @@ impl WirePolicy {
     }
 }
 
+/// What identifies a policy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PolicyId {
+    /// Incarnation of the learner that published it.
+    pub incarnation: u64,
+    /// Its version.
+    pub version: u64,
+}
+
+impl From<&PolicyHeader> for PolicyId {
+    fn from(header: &PolicyHeader) -> Self {
+        Self {
+            incarnation: header.incarnation,
+            version: header.version,
+        }
+    }
+}
+
 /// A host's request for a policy that it does not have. The gate answers when there is one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyRequest {
     /// The host.
     pub host: u64,
-    /// The policy that it has: the learner's incarnation, and the version.
-    pub have: Option<(u64, u64)>,
+    /// The policy that it has; `None` before the first.
+    pub have: Option<PolicyId>,
 }
 
 /// A host's request to be admitted to a run.

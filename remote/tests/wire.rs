@@ -8,8 +8,8 @@ use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::commit::ChunkId;
 use shoal_common::role::{Activity, Role};
 use shoal_remote::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode,
-    RemoteRole, ReportNumber, RunPhase, VERSION, WireChunk, WireError, WireLease, WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyId, PolicyRequest,
+    RemoteEpisode, RemoteRole, ReportNumber, RunPhase, VERSION, WireChunk, WireError, WireLease, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -116,7 +116,10 @@ fn report() -> HostReport {
 fn request() -> PolicyRequest {
     PolicyRequest {
         host: 9,
-        have: Some((1, 2)),
+        have: Some(PolicyId {
+            incarnation: 1,
+            version: 2,
+        }),
     }
 }
 

@@ -6,7 +6,6 @@ mod cleaning;
 mod ending;
 mod faults;
 
-use std::collections::BTreeSet;
 use std::os::fd::AsFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
@@ -25,7 +24,7 @@ use shoal_run::records::recorder::{Incident, IncidentKind};
 use shoal_run::signals::Signals;
 use tracing_subscriber::filter::LevelFilter;
 
-use self::actors::RefusedActors;
+use self::actors::ActorSet;
 use self::cleaning::Cleaning;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
@@ -71,25 +70,11 @@ pub(super) enum SupervisedHost {
 pub(super) struct Supervisor {
     children: Vec<Child>,
     services: Services,
-    /// Actors whose services for transitions exist, and those whose environment server has its services.
-    actors_with_services: BTreeSet<u32>,
-    servers_with_services: BTreeSet<u32>,
     /// Whether the learner is on this host.
     is_learner_host: bool,
     window: u32,
     cleaning: Cleaning,
-    /// The wanted actors of this host, in order.
-    actors: Vec<u32>,
-    /// How many further actors this host gets as soon as other hosts have released them.
-    actors_to_take: usize,
-    /// Set while the system refuses what wanted actors need.
-    refused_actors: Option<RefusedActors>,
-    /// The most actors that the run may have on all hosts.
-    max_actors: u32,
-    /// The most actors that this host may have. Their indices are below this number.
-    max_actors_here: u32,
-    /// The number of actors of a lockstep run, on all hosts together. It never changes.
-    lockstep_actors: Option<u32>,
+    actors: ActorSet,
     joined_hosts: JoinedHosts,
     log: Log,
     /// Incidents since the last [`Supervisor::take_incidents`].
@@ -156,18 +141,11 @@ impl Supervisor {
         Ok(Self {
             children,
             services,
-            actors_with_services: BTreeSet::new(),
-            servers_with_services: BTreeSet::new(),
             is_learner_host,
             window: config.actors.window,
             cleaning: Cleaning::new(),
-            actors,
-            actors_to_take: 0,
-            refused_actors: None,
+            actors: ActorSet::new(actors, lockstep_actors, &config.actors),
             joined_hosts: JoinedHosts::new(incarnations.last(), Duration::from_secs_f64(config.remote.lost_seconds)),
-            max_actors: config.actors.max,
-            max_actors_here: config.actors.max_on_a_host(),
-            lockstep_actors,
             log,
             incidents: Vec::new(),
             run: run.path().into(),
@@ -363,7 +341,7 @@ impl Supervisor {
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn time_to_next_task(&self) -> Duration {
-        let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
+        let missing = |child: &&Child| child.process.is_none() && self.actors.is_wanted(child);
         let now = Instant::now();
         let restarts = self.children.iter().filter(missing);
         restarts
@@ -425,7 +403,7 @@ impl Supervisor {
         {
             return Ok(true);
         }
-        let is_wanted = self.is_wanted(&self.children[i]);
+        let is_wanted = self.actors.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
         if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
             // A process that retired and is wanted again did not fail: this start is no restart.

@@ -8,9 +8,8 @@ use shoal_common::role::{Activity, Role};
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 
-use super::policies::PolicyId;
 use crate::network::CUT_OFF_AFTER;
-use crate::wire::{ActorAcknowledgement, HostReport, ReportNumber};
+use crate::wire::{ActorAcknowledgement, HostReport, PolicyId, ReportNumber};
 
 /// A host that is admitted.
 pub(super) struct Host {
@@ -38,7 +37,7 @@ pub(super) struct Host {
     /// The steps of its processes at the last status.
     pub(super) steps_at_last_status: HashMap<(Role, u32), (u64, u64)>,
     /// Its query for a policy, the policy that it has, and when the query arrived.
-    pub(super) policy_query: Option<(Query, PolicyId, Instant)>,
+    pub(super) policy_query: Option<(Query, Option<PolicyId>, Instant)>,
 }
 
 impl Host {

@@ -11,13 +11,10 @@ use zenoh::query::Query;
 use super::GateError;
 use super::host::Host;
 use crate::rate_limiter::RateLimiter;
-use crate::wire::WirePolicy;
+use crate::wire::{PolicyId, WirePolicy};
 
 /// How long a query for a policy is kept before the host has to ask again.
 const TIMEOUT: Duration = Duration::from_secs(8);
-
-/// The learner's incarnation and the version of a policy, if there is one.
-pub(super) type PolicyId = Option<(u64, u64)>;
 
 /// The learner's policies on their way to the hosts.
 pub(super) struct Policies {
@@ -65,12 +62,12 @@ impl Policies {
             return Ok(());
         };
         self.version = newest.header().version;
-        let id = id_of(&newest);
+        let id = PolicyId::from(newest.header());
         // The host that has waited longest comes first. Otherwise a host that asks again at once could keep the others
         // waiting.
         let waiting = hosts.values_mut().filter_map(|host| {
             let (_, have, since) = host.policy_query.as_ref()?;
-            (id != *have).then_some((*since, host))
+            (Some(id) != *have).then_some((*since, host))
         });
         let mut waiting: Vec<_> = waiting.collect();
         waiting.sort_by_key(|(since, _)| *since);
@@ -85,10 +82,6 @@ impl Policies {
         }
         Ok(())
     }
-}
-
-fn id_of(policy: &PublishedPolicy) -> PolicyId {
-    Some((policy.header().incarnation, policy.header().version))
 }
 
 /// Sends a policy from a thread of its own: a host with a slow connection must not delay the others. A host has one
@@ -106,7 +99,7 @@ fn answer(query: Query, bytes: Arc<Vec<u8>>) -> Result<(), GateError> {
 }
 
 fn encoded(cache: &mut Option<(PolicyId, Arc<Vec<u8>>)>, newest: &PublishedPolicy) -> Arc<Vec<u8>> {
-    let id = id_of(newest);
+    let id = PolicyId::from(newest.header());
     if let Some((_, bytes)) = cache.as_ref().filter(|(cached, _)| *cached == id) {
         return bytes.clone();
     }

@@ -1,8 +1,10 @@
 //! The actors of this host: which are wanted, and their services, start and retirement.
 
+use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::Domain;
+use shoal_common::config::ActorsConfig;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_remote::wire::cores;
@@ -19,9 +21,56 @@ const REFUSED_ACTORS_PAUSE: Duration = Duration::from_secs(1);
 
 /// Since when the system has refused what wanted actors need, and when to try again.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct RefusedActors {
+struct RefusedActors {
     since: Instant,
     retry_at: Instant,
+}
+
+/// The actors of this host, and how many there may be.
+#[derive(Debug)]
+pub(super) struct ActorSet {
+    /// The wanted actors of this host, in order.
+    pub(super) wanted: Vec<u32>,
+    /// How many further actors this host gets as soon as other hosts have released them.
+    pub(super) to_take: usize,
+    /// Set while the system refuses what wanted actors need.
+    refused: Option<RefusedActors>,
+    /// The most actors that the run may have on all hosts.
+    pub(super) max: u32,
+    /// The most actors that this host may have. Their indices are below this number.
+    pub(super) max_here: u32,
+    /// The number of actors of a lockstep run, on all hosts together. It never changes.
+    pub(super) lockstep_count: Option<u32>,
+    /// Actors whose services for transitions exist, and those whose environment server has its services.
+    with_services: BTreeSet<u32>,
+    servers_with_services: BTreeSet<u32>,
+}
+
+impl ActorSet {
+    pub(super) fn new(wanted: Vec<u32>, lockstep_count: Option<u32>, config: &ActorsConfig) -> Self {
+        Self {
+            wanted,
+            to_take: 0,
+            refused: None,
+            max: config.max,
+            max_here: config.max_on_a_host(),
+            lockstep_count,
+            with_services: BTreeSet::new(),
+            servers_with_services: BTreeSet::new(),
+        }
+    }
+
+    /// The wanted number of actors on this host.
+    fn count(&self) -> u32 {
+        (self.wanted.len() + self.to_take) as u32
+    }
+
+    /// Whether the child should run: not a surplus actor, and not the environment server of one.
+    pub(super) fn is_wanted(&self, child: &Child) -> bool {
+        let RoleInstance { role, index, .. } = child.instance;
+        // The index of the evaluator's server is the maximum number of actors.
+        !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max || self.wanted.contains(&index)
+    }
 }
 
 impl Supervisor {
@@ -37,8 +86,8 @@ impl Supervisor {
         };
         self.log.note("launcher", &format!("scaled from {what}"));
         self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, what));
-        self.actors.truncate(*here as usize);
-        self.actors_to_take = *here as usize - self.actors.len();
+        self.actors.wanted.truncate(*here as usize);
+        self.actors.to_take = *here as usize - self.actors.wanted.len();
         self.joined_hosts.set_wanted_actors(joined);
         self.take_free_actors();
         self.store_actors();
@@ -46,15 +95,15 @@ impl Supervisor {
 
     /// Takes free actors until this host has as many as are wanted. Another host may have to give some up first.
     pub(super) fn take_free_actors(&mut self) {
-        if self.actors_to_take > 0 {
-            let free = self.free_actors().filter(|index| *index < self.max_actors_here);
-            let more: Vec<u32> = free.take(self.actors_to_take).collect();
+        if self.actors.to_take > 0 {
+            let free = self.free_actors().filter(|index| *index < self.actors.max_here);
+            let more: Vec<u32> = free.take(self.actors.to_take).collect();
             if more.is_empty() {
                 return;
             }
-            self.actors_to_take -= more.len();
-            self.actors.extend(more);
-            self.actors.sort_unstable();
+            self.actors.to_take -= more.len();
+            self.actors.wanted.extend(more);
+            self.actors.wanted.sort_unstable();
             self.store_actors();
         }
     }
@@ -65,9 +114,9 @@ impl Supervisor {
         // By now another run may be at this path.
         let is_there = || run.directory_id().is_ok_and(|directory| directory == self.directory);
         if self.is_learner_host
-            && self.lockstep_actors.is_none()
+            && self.actors.lockstep_count.is_none()
             && is_there()
-            && let Err(error) = local_actors::write(&run, &self.actors)
+            && let Err(error) = local_actors::write(&run, &self.actors.wanted)
         {
             // The run goes on. The only effect is that the next launcher may give the hosts other actors.
             self.log.note("launcher", &format!("{error:#}"));
@@ -86,12 +135,12 @@ impl Supervisor {
 
     /// The wanted number of actors on this host.
     pub(crate) fn actor_count(&self) -> u32 {
-        (self.actors.len() + self.actors_to_take) as u32
+        self.actors.count()
     }
 
     /// Indices that neither this host nor another has.
     pub(super) fn free_actors(&self) -> impl Iterator<Item = u32> {
-        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.joined_hosts.has(*index))
+        (0..self.actors.max).filter(|index| !self.actors.wanted.contains(index) && !self.joined_hosts.has(*index))
     }
 
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
@@ -111,9 +160,9 @@ impl Supervisor {
         actors: impl IntoIterator<Item = u32>,
     ) -> anyhow::Result<()> {
         for actor in actors {
-            if !self.actors_with_services.contains(&actor) {
+            if !self.actors.with_services.contains(&actor) {
                 self.services.create_transitions(domain, actor, self.window)?;
-                self.actors_with_services.insert(actor);
+                self.actors.with_services.insert(actor);
             }
         }
         Ok(())
@@ -121,16 +170,16 @@ impl Supervisor {
 
     /// Creates the services of all wanted actors and their environment servers.
     pub(super) fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        for actor in &self.actors {
-            if !self.servers_with_services.contains(actor) {
+        for actor in &self.actors.wanted {
+            if !self.actors.servers_with_services.contains(actor) {
                 self.services.create_environment(domain, *actor)?;
-                self.servers_with_services.insert(*actor);
+                self.actors.servers_with_services.insert(*actor);
             }
         }
-        match self.actors.iter().max().copied() {
+        match self.actors.wanted.iter().max().copied() {
             // The learner opens those of all actors up to the last one.
             Some(last) if self.is_learner_host => self.create_transitions(domain, 0..=last),
-            _ => self.create_transitions(domain, self.actors.clone()),
+            _ => self.create_transitions(domain, self.actors.wanted.clone()),
         }
     }
 
@@ -141,7 +190,7 @@ impl Supervisor {
     /// When the system has refused for too long.
     pub(super) fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
         let now = Instant::now();
-        if self.refused_actors.is_some_and(|refused| now < refused.retry_at) {
+        if self.actors.refused.is_some_and(|refused| now < refused.retry_at) {
             return Ok(());
         }
         let missing = self.missing();
@@ -149,7 +198,7 @@ impl Supervisor {
             .create_wanted_services(domain)
             .and_then(|()| self.incarnations.reserve(missing.len() as u64));
         if let Err(error) = prepared {
-            let since = self.refused_actors.map_or(now, |refused| refused.since);
+            let since = self.actors.refused.map_or(now, |refused| refused.since);
             if now.duration_since(since) >= self.give_up_after {
                 return Err(error.context("further actors cannot be started"));
             }
@@ -159,10 +208,10 @@ impl Supervisor {
                 &format!("further actors: {error:#}; trying again in {pause:?}"),
             );
             let retry_at = now + pause;
-            self.refused_actors = Some(RefusedActors { since, retry_at });
+            self.actors.refused = Some(RefusedActors { since, retry_at });
             return Ok(());
         }
-        self.refused_actors = None;
+        self.actors.refused = None;
         for (role, index) in missing {
             self.children.push(Child::new(role, index));
             self.start(self.children.len() - 1)?;
@@ -172,7 +221,7 @@ impl Supervisor {
 
     /// The wanted actors and environment servers that do not exist, each server before its actor.
     pub(super) fn missing(&self) -> Vec<(Role, u32)> {
-        let wanted = self.actors.iter();
+        let wanted = self.actors.wanted.iter();
         let mut missing: Vec<_> = wanted
             .flat_map(|index| [(Role::EnvServer, *index), (Role::Actor, *index)])
             .collect();
@@ -188,7 +237,7 @@ impl Supervisor {
         };
         let mut children = std::mem::take(&mut self.children);
         children.retain(|child| {
-            let stays = child.process.is_some() || self.is_wanted(child);
+            let stays = child.process.is_some() || self.actors.is_wanted(child);
             if !stays {
                 self.log.note(&name(child.instance), "no longer needed");
             }
@@ -196,7 +245,7 @@ impl Supervisor {
         });
         self.children = children;
         for i in 0..self.children.len() {
-            if self.is_wanted(&self.children[i]) || self.children[i].is_retiring {
+            if self.actors.is_wanted(&self.children[i]) || self.children[i].is_retiring {
                 continue;
             }
             let may_end =
@@ -207,12 +256,5 @@ impl Supervisor {
                 process.ask_to_retire();
             }
         }
-    }
-
-    /// Whether the child should run: not a surplus actor, and not the environment server of one.
-    pub(super) fn is_wanted(&self, child: &Child) -> bool {
-        let RoleInstance { role, index, .. } = child.instance;
-        // The index of the evaluator's server is the maximum number of actors.
-        !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
     }
 }

@@ -29,16 +29,16 @@ impl Supervisor {
         if let Err(why) = ActorsConfig::check_on_a_host(requested) {
             return Ok(ControlResponse::Refused(why));
         }
-        let free: Vec<u32> = match self.lockstep_actors {
+        let free: Vec<u32> = match self.actors.lockstep_count {
             // Processes for these actors end here; those of the other host continue from the same snapshots.
-            Some(_) => self.actors.iter().rev().copied().collect(),
+            Some(_) => self.actors.wanted.iter().rev().copied().collect(),
             // The services of a retiring actor are in use.
             None => {
                 let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
                 let mut free: Vec<u32> = self.free_actors().filter(|index| !exists(*index)).collect();
                 // Actors that this host cannot have come first.
-                free.sort_by_key(|index| (*index < self.max_actors_here, *index));
-                let kept = self.actors_to_take + self.joined_hosts.reserved();
+                free.sort_by_key(|index| (*index < self.actors.max_here, *index));
+                let kept = self.actors.to_take + self.joined_hosts.reserved();
                 free.truncate(free.len().saturating_sub(kept));
                 free
             }
@@ -51,7 +51,7 @@ impl Supervisor {
         } else if free.len() >= requested {
             free[..requested].to_vec()
         } else {
-            if let Some(all) = self.lockstep_actors {
+            if let Some(all) = self.actors.lockstep_count {
                 return Ok(ControlResponse::Refused(format!(
                     "this lockstep run has {all} actors, of which other hosts have {}",
                     all as usize - free.len()
@@ -60,14 +60,14 @@ impl Supervisor {
             return Ok(ControlResponse::Refused(format!(
                 "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
                  are free",
-                self.max_actors,
+                self.actors.max,
                 free.len()
             )));
         };
         actors.sort_unstable();
         let first_incarnation = self.incarnations.take(HostLease::INCARNATIONS)?;
         // The learner opens those of all actors up to the last one that has a service of its own.
-        let with_service = actors.iter().filter(|index| **index < self.max_actors_here);
+        let with_service = actors.iter().filter(|index| **index < self.actors.max_here);
         let end = with_service.max().map_or(0, |last| last + 1);
         self.create_transitions(domain, 0..end)?;
         self.log
@@ -102,8 +102,8 @@ impl Supervisor {
 
     /// In a lockstep run this host has all actors that no other has.
     fn share_lockstep_actors(&mut self) {
-        if let Some(count) = self.lockstep_actors {
-            self.actors = (0..count).filter(|index| !self.joined_hosts.has(*index)).collect();
+        if let Some(count) = self.actors.lockstep_count {
+            self.actors.wanted = (0..count).filter(|index| !self.joined_hosts.has(*index)).collect();
         }
     }
 
