@@ -32,7 +32,7 @@ use self::measurement::{TimeBudget, print};
 
 /// The algorithms that [`Stage::Learner`] and [`Stage::Policy`] can measure, which learn from minibatches.
 pub fn algorithms() -> impl Iterator<Item = &'static str> {
-    AlgorithmConfig::of_minibatches().map(|algorithm| algorithm.name())
+    AlgorithmConfig::all_with_minibatches().map(|algorithm| algorithm.name())
 }
 
 /// A stage to measure.

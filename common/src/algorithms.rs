@@ -156,7 +156,7 @@ impl AlgorithmConfig {
     }
 
     /// Each algorithm that learns from minibatches, with its default settings.
-    pub fn of_minibatches() -> impl Iterator<Item = Self> {
+    pub fn all_with_minibatches() -> impl Iterator<Item = Self> {
         let all = Self::all().into_iter();
         all.filter(|algorithm| algorithm.properties().transition_use == TransitionUse::Minibatches)
     }

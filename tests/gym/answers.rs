@@ -5,8 +5,8 @@ use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
 use shoal_common::numbers::are_finite;
 use shoal_learner::replay::Replay;
 
+use crate::helpers::{SHORT, layout_of, place, server_of};
 use crate::support::{Leftovers, QUICK};
-use crate::{SHORT, layout_of, place, server_of};
 
 /// Something that a server does to its answers now and then.
 #[derive(Clone, Debug, serde::Serialize)]

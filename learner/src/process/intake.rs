@@ -117,22 +117,22 @@ impl Intake {
         self.actors.len()
     }
 
-    /// Takes one chunk of each actor in turn, until none is waiting, `most` of each were taken, or `enough` returns
-    /// true. Chunks of actors that share a service are taken in the order in which they come. Returns whether any chunk
-    /// was taken.
+    /// Takes one chunk of each actor in turn, until none is waiting, `max_chunks` of each were taken, or `enough`
+    /// returns true. Chunks of actors that share a service are taken in the order in which they come. Returns whether
+    /// any chunk was taken.
     ///
     /// # Errors
     /// When a channel fails, or a chunk does not belong to this run.
     pub fn take_in_turn(
         &mut self,
         replay: &mut Replay,
-        most: u32,
+        max_chunks: u32,
         enough: impl Fn(&Replay) -> bool,
     ) -> Result<bool, IntakeError> {
         let shared_turns = usize::from(self.shared.is_some()).max(self.sharing.len());
         let turns = self.actors.len() + shared_turns;
         let (mut any, mut idle) = (false, 0);
-        for _ in 0..u64::from(most) * turns as u64 {
+        for _ in 0..u64::from(max_chunks) * turns as u64 {
             if idle >= turns || enough(replay) || replay.head() >= self.limit {
                 break;
             }

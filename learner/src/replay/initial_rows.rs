@@ -10,18 +10,18 @@ use super::store::Replay;
 const AT_ONCE: u64 = 4_096;
 
 impl Replay {
-    /// Fills this empty replay with the newest rows of another one, at most `most` and at most a ring, and syncs them.
-    /// Returns their number.
+    /// Fills this empty replay with the newest rows of another one, at most `max_rows` and at most a ring, and syncs
+    /// them. Returns their number.
     ///
     /// # Errors
     /// When the file cannot be synced.
     ///
     /// # Panics
     /// If this replay is not empty, or its rows have another layout.
-    pub fn inherit_rows(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
+    pub fn inherit_rows(&mut self, other: &Self, max_rows: u64) -> Result<u64, ReplayError> {
         assert_eq!(self.layout.row, other.layout.row, "rows of another layout");
         let rows = other.rows();
-        let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
+        let first = rows.end.saturating_sub(max_rows.min(self.layout.ring)).max(rows.start);
         self.begin_with(rows.end - first, |index| other.row(first + index))
     }
 
@@ -93,10 +93,10 @@ mod tests {
             };
             old.append_and_commit(0, id, &rows).unwrap();
         }
-        for (ring, most, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
-            let name = path(&format!("{ring}-{most}"));
+        for (ring, max_rows, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
+            let name = path(&format!("{ring}-{max_rows}"));
             let mut new = Replay::create(&name, &layout(ring)).unwrap();
-            assert_eq!(new.inherit_rows(&old, most).unwrap(), expected);
+            assert_eq!(new.inherit_rows(&old, max_rows).unwrap(), expected);
             drop(new);
             let mut new = Replay::open(&name, &layout(ring)).unwrap();
             assert!(new.warnings().is_empty(), "{:?}", new.warnings());

@@ -14,9 +14,9 @@ pub struct Frames {
 }
 
 /// Collects the pictures of an episode as it is played. A long episode is thinned out: whenever there are more than
-/// `most`, every second one is dropped.
+/// `max_frames`, every second one is dropped.
 pub(super) struct FrameCollector {
-    most: usize,
+    max_frames: usize,
     stride: usize,
     frames: Vec<Frame>,
     fps: Option<f64>,
@@ -24,10 +24,10 @@ pub(super) struct FrameCollector {
 }
 
 impl FrameCollector {
-    /// At most `most` pictures, but at least two, of every state or of every `stride`th.
-    pub(super) fn new(most: usize, stride: usize) -> Self {
+    /// At most `max_frames` pictures, but at least two, of every state or of every `stride`th.
+    pub(super) fn new(max_frames: usize, stride: usize) -> Self {
         Self {
-            most: most.max(2),
+            max_frames: max_frames.max(2),
             stride: stride.max(1),
             frames: Vec::new(),
             fps: None,
@@ -61,7 +61,7 @@ impl FrameCollector {
 
     fn push(&mut self, frame: Frame) {
         self.frames.push(frame);
-        if self.frames.len() > self.most {
+        if self.frames.len() > self.max_frames {
             keep_every_second(&mut self.frames);
             self.stride *= 2;
         }
@@ -104,8 +104,8 @@ mod tests {
 
     #[test]
     fn a_long_episode_is_thinned_out_evenly() {
-        for (steps, most, stride) in [(4, 10, 1), (9, 10, 1), (10, 10, 2), (100, 10, 16), (1000, 7, 256)] {
-            let mut collector = FrameCollector::new(most, 1);
+        for (steps, max_frames, stride) in [(4, 10, 1), (9, 10, 1), (10, 10, 2), (100, 10, 16), (1000, 7, 256)] {
+            let mut collector = FrameCollector::new(max_frames, 1);
             for step in 0..=steps {
                 if collector.wants(step) {
                     let frame = Ok(picture(step));

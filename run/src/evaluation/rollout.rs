@@ -132,23 +132,23 @@ impl<'a> Rollout<'a> {
             .map(|(trajectory, _)| trajectory)
     }
 
-    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures. If there are none,
-    /// returns the reason: a sentence without its full stop. If another program serves the environment, the rollout
-    /// must have been made with [`with_pictures`](Self::with_pictures). Drawing takes much longer than stepping, so a
-    /// long episode is played twice: first to find its length, then to draw evenly spaced states. Calls `progress` with
-    /// the number of steps.
+    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `max_frames` pictures. If there are
+    /// none, returns the reason: a sentence without its full stop. If another program serves the environment, the
+    /// rollout must have been made with [`with_pictures`](Self::with_pictures). Drawing takes much longer than
+    /// stepping, so a long episode is played twice: first to find its length, then to draw evenly spaced states. Calls
+    /// `progress` with the number of steps.
     pub fn filmed_episode(
         &mut self,
         (seed, number): (u64, u64),
-        most: usize,
+        max_frames: usize,
         mut progress: impl FnMut(usize),
     ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
         let mut stride = 1;
-        if self.config.spec.time_limit as usize >= most {
+        if self.config.spec.time_limit as usize >= max_frames {
             let (played, _) = self.episode(evaluation(seed, number), &mut |_| (), None)?;
-            stride = played.actions.len().div_ceil(most.max(2) - 1);
+            stride = played.actions.len().div_ceil(max_frames.max(2) - 1);
         }
-        self.episode(evaluation(seed, number), &mut progress, Some((most, stride)))
+        self.episode(evaluation(seed, number), &mut progress, Some((max_frames, stride)))
     }
 
     /// Runs an episode that starts in this physical state of the environment, which must be a built-in one.
@@ -166,7 +166,7 @@ impl<'a> Rollout<'a> {
     ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
         let mut tries = 1;
         loop {
-            let mut collector = frames.map(|(most, stride)| FrameCollector::new(most, stride));
+            let mut collector = frames.map(|(max_frames, stride)| FrameCollector::new(max_frames, stride));
             match self.try_episode(reset, progress, &mut collector) {
                 Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.environment.can_be_restarted() => {
                     tries += 1;

@@ -67,7 +67,7 @@ pub struct SettingSources(BTreeMap<String, SettingSource>);
 fn bounding(key: &str) -> Vec<String> {
     match key {
         "replay.warmup" => vec!["replay.capacity".into()],
-        "replay.capacity" => AlgorithmConfig::of_minibatches()
+        "replay.capacity" => AlgorithmConfig::all_with_minibatches()
             .map(|of| format!("{}.batch", of.name()))
             .collect(),
         "actors.count" => vec!["actors.max".into()],
