@@ -21,7 +21,7 @@ pub use preparation::{ObservationConfig, RewardConfig};
 pub use reinforce::{ReinforceConfig, ReinforceNetworks, ReturnWeighting};
 pub use sac::SacConfig;
 use serde::Serialize;
-use shoal_base::section::{self, OutOfRange, Section, describe};
+use shoal_base::section::{self, OutOfRange, Section, SectionError, describe};
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_policy::PolicyError;
 pub use tabular::TabularConfig;
@@ -88,7 +88,7 @@ macro_rules! registry {
             ///
             /// # Errors
             /// When a key is unknown or of the wrong type. The error names the key and its value.
-            pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
+            pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, SectionError>> {
                 $(if name == $properties.name {
                     return Some(section::read(name, section).map(Self::$variant));
                 })*

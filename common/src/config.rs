@@ -28,6 +28,7 @@ pub use learner::LearnerConfig;
 pub use remote::RemoteConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
+use sections::Sections;
 use shoal_base::message::one_line;
 use shoal_base::section;
 pub use shoal_base::section::{Change, OutOfRange};
@@ -67,6 +68,17 @@ pub struct Config {
     pub remote: RemoteConfig,
 }
 
+/// What a configuration is refused for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Subject {
+    /// A key, with its section.
+    Key(String),
+    /// Whole sections, by their names.
+    Sections(Vec<String>),
+    /// Something without a name of its own.
+    Unknown,
+}
+
 /// Why a configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -83,6 +95,8 @@ pub enum ConfigError {
     Malformed {
         /// Where the text came from, if it has a name.
         origin: Option<String>,
+        /// The part of it that is wrong.
+        subject: Subject,
         /// What is wrong with it, on one line.
         message: String,
     },
@@ -107,6 +121,22 @@ pub enum ConfigError {
         /// The algorithms that can.
         fitting: String,
     },
+}
+
+impl ConfigError {
+    /// What the configuration is refused for.
+    pub fn subject(&self) -> Subject {
+        match self {
+            Self::OutOfRange(OutOfRange { key, .. }) => {
+                // A number of a list has its index behind the key.
+                let key = key.split_once('[').map_or(key.as_str(), |(key, _)| key);
+                Subject::Key(key.into())
+            }
+            Self::Malformed { subject, .. } => subject.clone(),
+            Self::Control { algorithm, .. } => Subject::Sections(vec![(*algorithm).into()]),
+            Self::Unreadable { .. } | Self::Syntax { .. } => Subject::Unknown,
+        }
+    }
 }
 
 impl Config {
@@ -142,9 +172,18 @@ impl Config {
     }
 
     fn read(table: &toml::Table, origin: Option<&dyn Display>) -> Result<Self, ConfigError> {
-        let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
+        let malformed = |(subject, message)| ConfigError::Malformed {
             origin: origin.map(ToString::to_string),
-            message: sections::first_unreadable(table).unwrap_or_else(|| one_line(error.message())),
+            subject,
+            message,
+        };
+        let sections: Sections = table.clone().try_into().map_err(|error: toml::de::Error| {
+            let unreadable = sections::first_unreadable(table);
+            malformed(unreadable.unwrap_or_else(|| (Subject::Unknown, one_line(error.message()))))
+        })?;
+        let config = Self::try_from(sections).map_err(|error| {
+            let unreadable = sections::first_unreadable(table);
+            malformed(unreadable.unwrap_or_else(|| (error.subject.clone(), error.to_string())))
         })?;
         config.check()?;
         Ok(config)
@@ -157,6 +196,7 @@ impl Config {
     pub fn to_toml(&self) -> Result<String, ConfigError> {
         toml::to_string(self).map_err(|error| ConfigError::Malformed {
             origin: Some("configuration".into()),
+            subject: Subject::Unknown,
             message: error.to_string(),
         })
     }

@@ -12,17 +12,26 @@ pub use explanation::{Key, Section, describe, keys};
 
 use std::fmt::Display;
 
-use serde::de::{DeserializeOwned, Error};
+use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 use crate::message::one_line;
 
+/// Why a section cannot be read: a key is unknown or of the wrong type.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct SectionError {
+    /// The key at fault, with its section; `None` if not a single key is at fault.
+    pub key: Option<String>,
+    /// What is wrong, on one line. It begins with the key and its value, or with the section.
+    pub message: String,
+}
+
 /// Reads the section `name`, whose type is `T`. Every key is optional.
 ///
 /// # Errors
-/// When a key is unknown or of the wrong type. If a single key is at fault, the error begins with that key and its
-/// value.
-pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::de::Error> {
+/// When a key is unknown or of the wrong type.
+pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, SectionError> {
     // serde's error does not name the key, so each key is read alone to find the faulty one.
     let alone = |(key, value): (&String, &Value)| {
         let only = Table::from_iter([(key.clone(), value.clone())]);
@@ -31,15 +40,18 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
         // The value is a list, and one of its items has the wrong type.
         let each = value.is_array() && reason != error.message();
         let each = if each { "each " } else { "" };
-        Some(Error::custom(refusal(
-            format!("{name}.{key}"),
-            value,
-            &format!("{each}{reason}"),
-        )))
+        let key = format!("{name}.{key}");
+        Some(SectionError {
+            message: refusal(&key, value, &format!("{each}{reason}")),
+            key: Some(key),
+        })
     };
     T::deserialize(section.clone()).map_err(|error| {
         let mut keys = section.as_table().into_iter().flatten();
-        keys.find_map(alone).unwrap_or(error)
+        keys.find_map(alone).unwrap_or_else(|| SectionError {
+            key: None,
+            message: format!("[{name}]: {}", one_line(error.message())),
+        })
     })
 }
 

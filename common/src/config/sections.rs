@@ -1,19 +1,19 @@
 //! The sections of the configuration's text. At most one of the algorithms' sections may be present.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
-use shoal_base::message::one_line;
+use shoal_base::section::SectionError;
 use shoal_base::space::EnvironmentSpec;
 use toml::Table;
 
 use super::{
     ActorsConfig, AlgorithmConfig, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
-    LearnerConfig, ObservationConfig, RemoteConfig, ReplayConfig, RewardConfig, RunConfig, explanation,
+    LearnerConfig, ObservationConfig, RemoteConfig, ReplayConfig, RewardConfig, RunConfig, Subject, explanation,
 };
 use crate::algorithms::TransitionUse;
 
 /// The sections as they are read.
 #[derive(Deserialize)]
-struct Sections {
+pub(super) struct Sections {
     run: RunConfig,
     environment: EnvironmentConfig,
     spec: EnvironmentSpec,
@@ -68,17 +68,45 @@ impl<'de> Deserialize<'de> for Config {
     }
 }
 
-impl TryFrom<Sections> for Config {
-    type Error = String;
+/// Why sections that can be read one by one are not a configuration.
+#[derive(Debug, thiserror::Error)]
+#[error("{message}")]
+pub(super) struct SectionsError {
+    pub(super) subject: Subject,
+    message: String,
+}
 
-    fn try_from(sections: Sections) -> Result<Self, String> {
+impl SectionsError {
+    fn new(sections: &[&str], message: String) -> Self {
+        let names = sections.iter().map(|name| (*name).to_owned());
+        Self {
+            subject: Subject::Sections(names.collect()),
+            message,
+        }
+    }
+}
+
+impl From<SectionError> for SectionsError {
+    fn from(error: SectionError) -> Self {
+        Self {
+            subject: error.key.map_or(Subject::Unknown, Subject::Key),
+            message: error.message,
+        }
+    }
+}
+
+impl TryFrom<Sections> for Config {
+    type Error = SectionsError;
+
+    fn try_from(sections: Sections) -> Result<Self, SectionsError> {
         let mut algorithm = one_algorithm(sections.others)?;
         if let Some(exploration) = sections.exploration {
             // Only DDPG has a section for its exploration.
             let AlgorithmConfig::Ddpg(ddpg) = &mut algorithm else {
-                return Err(format!(
-                    "[exploration] is the noise of ddpg, but this configuration is for {}",
-                    algorithm.name()
+                let why = "[exploration] is the noise of ddpg, but this configuration is for";
+                return Err(SectionsError::new(
+                    &["exploration"],
+                    format!("{why} {}", algorithm.name()),
                 ));
             };
             ddpg.exploration = exploration;
@@ -89,10 +117,11 @@ impl TryFrom<Sections> for Config {
         );
         let are_default = observation == ObservationConfig::default() && reward == RewardConfig::default();
         if !are_default && algorithm.properties().transition_use != TransitionUse::Minibatches {
-            return Err(format!(
-                "[observation] and [reward] are for algorithms that learn from minibatches, but this configuration is \
-                 for {}",
-                algorithm.name()
+            let why = "[observation] and [reward] are for algorithms that learn from minibatches, but this \
+                       configuration is for";
+            return Err(SectionsError::new(
+                &["observation", "reward"],
+                format!("{why} {}", algorithm.name()),
             ));
         }
         Ok(Self {
@@ -112,45 +141,37 @@ impl TryFrom<Sections> for Config {
     }
 }
 
-/// The error of the first section that cannot be read. It begins with the key and its value, which serde's own error
-/// does not name.
-pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
+/// What the first section that cannot be read is refused for, and why. serde's own error does not name the key.
+pub(super) fn first_unreadable(sections: &Table) -> Option<(Subject, String)> {
     explanation::sections().into_iter().find_map(|section| {
         let name = section.name;
-        let error = (section.check)(name, sections.get(name)?.clone()).err()?;
-        let message = one_line(error.message());
-        let is_named = message.starts_with(&format!("{name}."));
-        Some(if is_named {
-            message
-        } else {
-            format!("[{name}]: {message}")
-        })
+        let SectionError { key, message } = (section.check)(name, sections.get(name)?.clone()).err()?;
+        let subject = key.map_or_else(|| Subject::Sections(vec![name.into()]), Subject::Key);
+        Some((subject, message))
     })
 }
 
 /// The algorithm that has a section, or the default algorithm if none has one.
-fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
+fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, SectionsError> {
     let named = AlgorithmConfig::all_in(&sections);
     let is_unknown = |section: &&String| !named.iter().any(|algorithm| algorithm.name == section.as_str());
     if let Some(unknown) = sections.keys().find(is_unknown) {
         let known = explanation::sections().into_iter().map(|section| section.name);
         let known: Vec<String> = known.chain(["spec"]).map(|name| format!("`{name}`")).collect();
-        return Err(format!(
-            "unknown field `{unknown}`, expected one of {}",
-            known.join(", ")
-        ));
+        let message = format!("unknown field `{unknown}`, expected one of {}", known.join(", "));
+        return Err(SectionsError::new(&[unknown.as_str()], message));
     }
     if let [one, other, ..] = named.as_slice() {
-        return Err(format!(
-            "there are sections for two algorithms, [{}] and [{}]: keep one",
-            one.name, other.name
+        let (one, other) = (one.name, other.name);
+        return Err(SectionsError::new(
+            &[one, other],
+            format!("there are sections for two algorithms, [{one}] and [{other}]: keep one"),
         ));
     }
     let read = named
         .into_iter()
         .find_map(|algorithm| AlgorithmConfig::read(algorithm.name, sections.remove(algorithm.name)?));
-    read.unwrap_or_else(|| Ok(AlgorithmConfig::default()))
-        .map_err(|error| error.message().to_owned())
+    Ok(read.unwrap_or_else(|| Ok(AlgorithmConfig::default()))?)
 }
 
 impl Serialize for Config {
@@ -198,7 +219,8 @@ mod tests {
         let rest = "[run]\nid = \"1a\"\n[environment]\nname = \"x\"\n\
             [spec]\ntime_limit = 100\nobservation.discrete.n = 16\naction.discrete.n = 4\n";
         let sections: Sections = toml::from_str(&format!("{rest}{text}")).unwrap();
-        Config::try_from(sections).map(|config| config.algorithm)
+        let config = Config::try_from(sections).map_err(|error| error.to_string())?;
+        Ok(config.algorithm)
     }
 
     #[test]

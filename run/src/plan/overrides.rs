@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser};
 use shoal_common::config::explanation::{self, Key};
-use shoal_common::config::{AlgorithmConfig, Config};
+use shoal_common::config::{AlgorithmConfig, Config, OutOfRange};
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment;
 use toml::{Table, Value};
@@ -219,7 +219,7 @@ fn did_you_mean(key: &str, table: &Table) -> String {
 }
 
 /// Replaces numbers such as `1e5` and `30k` by whole numbers, for keys that take whole numbers.
-pub(super) fn read_counts(table: &mut Table) -> Result<(), UsageError> {
+pub(super) fn read_counts(table: &mut Table) -> Result<(), OutOfRange> {
     let mut keys: Vec<(&str, Key)> = Vec::new();
     for section in explanation::sections() {
         keys.extend(section.keys.into_iter().map(|key| (section.name, key)));
@@ -241,13 +241,12 @@ pub(super) fn read_counts(table: &mut Table) -> Result<(), UsageError> {
             _ => continue,
         };
         let read = parse_count(&text).ok().and_then(|number| i64::try_from(number).ok());
-        let refused = || {
-            format!(
-                "{section}.{} = {value}: must be a whole number, such as 1000, 1e5 or 30k",
-                key.name
-            )
+        let refused = || OutOfRange {
+            key: format!("{section}.{}", key.name),
+            value: value.to_string(),
+            expected: "a whole number, such as 1000, 1e5 or 30k".into(),
         };
-        *value = read.ok_or_else(|| UsageError(refused()))?.into();
+        *value = read.ok_or_else(refused)?.into();
     }
     Ok(())
 }

@@ -16,7 +16,6 @@ use super::source::{SettingSource, SettingSources};
 use super::table::{integer, put};
 use crate::origin::{Origin, shapes};
 use crate::signals::Interrupt;
-use crate::usage::UsageError;
 
 /// The resolved configuration of a preset or a file, without overrides.
 pub fn resolve_preset(what: &str) -> anyhow::Result<Config> {
@@ -62,8 +61,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides, interrupt: Inter
     for assignment in &overrides.set {
         set_key(&mut table, &mut sources, assignment)?;
     }
-    let mistaken = |error: UsageError, sources: &SettingSources, table: &Table| sources.explain(error.0, what, table);
-    read_counts(&mut table).map_err(|error| mistaken(error, &sources, &table))?;
+    read_counts(&mut table).map_err(|error| sources.explain(&error.into(), what, &table))?;
     // For more actors than the default of `actors.max`, raise it, but not beyond its bounds.
     if let Some(count) = integer(&table, "actors", "count")
         && count > i64::from(ActorsConfig::default().max)
@@ -105,7 +103,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides, interrupt: Inter
     if let Some(dataset) = overrides.absolute_dataset()? {
         put(&mut table, &["run", "demonstrations"], dataset.into())?;
     }
-    let mut config = Config::from_settings(&table).map_err(|error| sources.explain(error.to_string(), what, &table))?;
+    let mut config = Config::from_settings(&table).map_err(|error| sources.explain(&error, what, &table))?;
     // A short run must end with an evaluation too.
     if config.run.steps < config.evaluation.every {
         config.evaluation.every = config.run.steps;

@@ -77,9 +77,8 @@ impl Revision {
             check_algorithm(assignment, used)?;
             set_key(&mut table, &mut sources, assignment)?;
         }
-        let explain = |message: String, table: &Table| sources.explain(message, &origin, table);
-        read_counts(&mut table).map_err(|error| explain(error.0, &table))?;
-        let mut config = Config::from_settings(&table).map_err(|error| explain(error.to_string(), &table))?;
+        read_counts(&mut table).map_err(|error| sources.explain(&error.into(), &origin, &table))?;
+        let mut config = Config::from_settings(&table).map_err(|error| sources.explain(&error, &origin, &table))?;
         set_from_length(&mut config, &mut SettingSources::default());
         let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
         // These two are in the other file alone, because `config.toml` is written before a change is final.

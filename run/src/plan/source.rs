@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 
 use shoal_common::algorithms::AlgorithmConfig;
+use shoal_common::config::{ConfigError, OutOfRange, Subject};
 use shoal_common::section::line_at;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
@@ -140,19 +141,21 @@ impl SettingSources {
         self.0.get(key).cloned().unwrap_or_default()
     }
 
-    /// The error for a refused configuration, whose message begins with the key at fault. It names what the user has
-    /// set, and where.
-    pub(super) fn explain(&self, message: String, origin: &str, table: &Table) -> anyhow::Error {
-        let message = with_suggestion(message);
-        let named = message.split_once(" = ").map_or("", |(key, _)| key);
-        let key = named.split('[').next().filter(|key| !key.is_empty()).unwrap_or(named);
-        if let Some(of_environment) = message.strip_prefix("spec.") {
-            return anyhow::anyhow!("{origin}: the environment's {of_environment}");
+    /// The error for a refused configuration. It names what the user has set, and where.
+    pub(super) fn explain(&self, error: &ConfigError, origin: &str, table: &Table) -> anyhow::Error {
+        let message = with_suggestion(error.to_string());
+        match error.subject() {
+            Subject::Key(key) if key.starts_with("spec.") => {
+                let of_environment = message.strip_prefix("spec.").unwrap_or(&message);
+                anyhow::anyhow!("{origin}: the environment's {of_environment}")
+            }
+            Subject::Key(key) if self.of(&key).is_from_user() => self.error_naming_source(&key, &message),
+            Subject::Key(_) => self
+                .explain_bounding(error, table)
+                .unwrap_or_else(|| self.explain_sections(&[], &message, origin)),
+            Subject::Sections(names) => self.explain_sections(&names, &message, origin),
+            Subject::Unknown => self.explain_sections(&[], &message, origin),
         }
-        if self.of(key).is_from_user() {
-            return self.error_naming_source(key, &message);
-        }
-        self.explain_other(key, &message, origin, table)
     }
 
     /// The error for a key that the user may have set: names the option, or the file and the line.
@@ -172,34 +175,30 @@ impl SettingSources {
         }
     }
 
-    /// The same for a key that the user has not set, or that the message does not name.
-    fn explain_other(&self, key: &str, message: &str, origin: &str, table: &Table) -> anyhow::Error {
-        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_from_user()) else {
-            return self.explain_section(message, origin);
+    /// The same for a key that the user has not set, if the user has set one that bounds its value.
+    fn explain_bounding(&self, error: &ConfigError, table: &Table) -> Option<anyhow::Error> {
+        let ConfigError::OutOfRange(OutOfRange { key, value, expected }) = error else {
+            return None;
         };
-        let value = other
+        let set = bounding(key).into_iter().find(|other| self.of(other).is_from_user())?;
+        let set_value = set
             .split_once('.')
             .and_then(|(section, key)| table.get(section)?.get(key));
-        let value = value.map_or_else(String::new, Value::to_string);
-        let (stated, expected) = message.split_once(": ").unwrap_or((message, ""));
-        let advice = match self.of(key) {
+        let set_value = set_value.map_or_else(String::new, Value::to_string);
+        let source = self.of(key);
+        let advice = match source {
             SettingSource::Run => String::new(),
             _ => format!("; set {key} too"),
         };
         let text = format!(
-            "{other} = {value}: does not go with {stated} ({}), which {expected}{advice}",
-            self.of(key)
+            "{set} = {set_value}: does not go with {key} = {value} ({source}), which must be {expected}{advice}"
         );
-        self.error_naming_source(&other, &text)
+        Some(self.error_naming_source(&set, &text))
     }
 
-    /// The same for a message about whole sections.
-    fn explain_section(&self, message: &str, origin: &str) -> anyhow::Error {
-        let mut words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
-        if let Some((algorithm, _)) = message.split_once(" cannot control ") {
-            words = vec![algorithm];
-        }
-        let mut places = words.iter().map(|word| self.of(&format!("[{word}]")));
+    /// The same for an error about whole sections, or about nothing that the user has named.
+    fn explain_sections(&self, names: &[String], message: &str, origin: &str) -> anyhow::Error {
+        let mut places = names.iter().map(|name| self.of(&format!("[{name}]")));
         match places.find(|place| *place != SettingSource::Default) {
             Some(SettingSource::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
             Some(_) => UsageError(message.into()).into(),

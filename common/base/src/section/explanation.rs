@@ -8,7 +8,7 @@ use serde_json::Value as Json;
 use toml::{Table, Value};
 
 use super::change::Change;
-use super::read;
+use super::{SectionError, read};
 
 /// The explanation of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -41,7 +41,7 @@ pub struct Section {
     /// The default values; some keys have none.
     pub defaults: Table,
     /// Reads a section of this name and type, and returns the error if that fails.
-    pub check: fn(&str, Value) -> Result<(), toml::de::Error>,
+    pub check: fn(&str, Value) -> Result<(), SectionError>,
 }
 
 /// The section whose type is `T`.
