@@ -50,7 +50,7 @@ impl<T: Send + 'static> LauncherRequests<T> {
 }
 
 fn ask(run_id: &str, max_actors: u32, run: RunDirId, request: ControlRequest) -> Result<ControlResponse, String> {
-    let domain = Domain::visit(run_id, max_actors).map_err(|error| error.to_string())?;
+    let domain = Domain::join_as_client(run_id, max_actors).map_err(|error| error.to_string())?;
     let answer = control::ask(&domain, run, request, TIMEOUT, || true);
     let left = domain.leave();
     let answer = answer.map_err(|error| error.to_string())?;

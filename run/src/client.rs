@@ -51,7 +51,7 @@ impl RunClient {
             if !self.run.is_running()? {
                 return Ok(None);
             }
-            let domain = Domain::visit(&self.config.run.id, self.config.actors.max_on_a_host())?;
+            let domain = Domain::join_as_client(&self.config.run.id, self.config.actors.max_on_a_host())?;
             let remaining = timeout.saturating_sub(begun.elapsed());
             let answer = self.ask_in(&domain, request.clone(), remaining);
             let left = domain.leave();

@@ -91,7 +91,7 @@ fn a_living_run_whose_directory_is_removed_keeps_its_shared_memory() {
     assert!(before.len() > 5, "this test finds the run's files");
     // As another run at its start, a terminal that asks, and a process that is started again.
     Domain::remove_abandoned().unwrap();
-    Domain::visit(domain.run_id(), 1).unwrap().leave().unwrap();
+    Domain::join_as_client(domain.run_id(), 1).unwrap().leave().unwrap();
     run.join().leave().unwrap();
     Domain::remove_abandoned().unwrap();
     let after = run.leftovers();

@@ -371,9 +371,9 @@ mod tests {
         let a_minute = Timespec { tv_sec: 60, tv_nsec: 0 };
         std::thread::scope(|scope| {
             let asker = scope.spawn(|| {
-                let visitor = Domain::visit(&run_id, 1).unwrap();
-                let answer = ask(&visitor, run, ControlRequest::Stop, Duration::from_secs(60), || true);
-                visitor.leave().unwrap();
+                let client = Domain::join_as_client(&run_id, 1).unwrap();
+                let answer = ask(&client, run, ControlRequest::Stop, Duration::from_secs(60), || true);
+                client.leave().unwrap();
                 answer
             });
             let mut asked = 0;
@@ -402,22 +402,22 @@ mod tests {
     fn a_busy_lock_is_not_taken_for_new_shared_memory() {
         let run_id = format!("l{:x}", std::process::id());
         let domain = Domain::join(&run_id, 1).unwrap();
-        let visitor = Domain::visit(&run_id, 1).unwrap();
+        let client = Domain::join_as_client(&run_id, 1).unwrap();
         let held = std::fs::File::open(domain.directory().unwrap()).unwrap();
         held.lock().unwrap();
         let run = RunDirId { device: 1, inode: 2 };
-        let answer = ask(&visitor, run, ControlRequest::Stop, Duration::ZERO, || true);
+        let answer = ask(&client, run, ControlRequest::Stop, Duration::ZERO, || true);
         drop(held);
         assert!(
             matches!(answer, Err(ControlError::Domain(DomainError::Locked(_)))),
             "{answer:?}"
         );
-        visitor.leave().unwrap();
+        client.leave().unwrap();
         domain.leave().unwrap();
     }
 
     #[test]
-    fn a_visitor_that_outlives_a_run_leaves_the_next_one_of_that_name_alone() {
+    fn a_client_that_outlives_a_run_leaves_the_next_one_of_that_name_alone() {
         let run_id = format!("b{:x}", std::process::id());
         let begin = || {
             let domain = Domain::join(&run_id, 1).unwrap();
@@ -432,11 +432,11 @@ mod tests {
         let minute = Duration::from_secs(60);
         let run = RunDirId { device: 1, inode: 2 };
         let first = begin();
-        let visitor = Domain::visit(&run_id, 1).unwrap();
+        let client = Domain::join_as_client(&run_id, 1).unwrap();
         let second = std::thread::scope(|scope| {
             let (asked, has_asked) = std::sync::mpsc::channel();
             let (begun, has_begun) = std::sync::mpsc::channel::<()>();
-            let visitor = &visitor;
+            let client = &client;
             let asker = scope.spawn(move || {
                 // It is called first when the request has been sent. Nobody answers.
                 let is_alive = || {
@@ -444,7 +444,7 @@ mod tests {
                     let _ = has_begun.recv_timeout(minute);
                     true
                 };
-                ask(visitor, run, ControlRequest::Stop, minute, is_alive)
+                ask(client, run, ControlRequest::Stop, minute, is_alive)
             });
             has_asked.recv_timeout(minute).unwrap();
             end(first);
@@ -454,12 +454,12 @@ mod tests {
             assert!(matches!(answer, Err(ControlError::Removed)), "{answer:?}");
             second
         });
-        // A visitor that has not asked yet.
-        let answer = ask(&visitor, run, ControlRequest::Stop, minute, || true);
+        // A client that has not asked yet.
+        let answer = ask(&client, run, ControlRequest::Stop, minute, || true);
         assert!(matches!(answer, Err(ControlError::Removed)), "{answer:?}");
         assert!(second.0.is_intact(second.1.count()));
         assert_eq!(second.1.ports(), 0);
         end(second);
-        visitor.leave().unwrap();
+        client.leave().unwrap();
     }
 }

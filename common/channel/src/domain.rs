@@ -21,8 +21,8 @@ use super::memory;
 /// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How long a visitor waits for a run's lock. Without it, it makes no ports and does not drop those it has.
-const VISITOR_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long a client waits for a run's lock. Without it, it makes no ports and does not drop those it has.
+const CLIENT_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How a process takes part in a run.
 #[derive(Clone, Copy, Debug)]
@@ -30,7 +30,7 @@ enum Participant {
     /// A process of the run.
     Member,
     /// A process that only asks the run's launcher something.
-    Visitor,
+    Client,
 }
 
 impl Participant {
@@ -38,7 +38,8 @@ impl Participant {
     fn node_name(self) -> &'static str {
         match self {
             Self::Member => "",
-            Self::Visitor => "visitor",
+            // Programs of earlier versions know this name.
+            Self::Client => "visitor",
         }
     }
 }
@@ -47,7 +48,7 @@ impl Participant {
 #[derive(Debug)]
 pub struct Domain {
     node: Node<ipc::Service>,
-    /// `None` for visitors.
+    /// `None` for clients.
     membership: Option<Membership>,
     /// The user's directory, with a shared lock: systemd does not tidy up a locked directory.
     _user_root: Option<File>,
@@ -109,12 +110,12 @@ impl Domain {
         Self::enter(run_id, max_actors, Participant::Member)
     }
 
-    /// Joins the run as a visitor, which only asks its launcher something. The run does not wait for visitors to end.
+    /// Joins the run as a client, which only asks its launcher something. The run does not wait for clients to end.
     ///
     /// # Errors
     /// As [`join`](Self::join).
-    pub fn visit(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
-        Self::enter(run_id, max_actors, Participant::Visitor)
+    pub fn join_as_client(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
+        Self::enter(run_id, max_actors, Participant::Client)
     }
 
     fn enter(run_id: &str, max_actors: u32, participant: Participant) -> Result<Self, DomainError> {
@@ -124,7 +125,7 @@ impl Domain {
         let lock = make_and_lock(&directory)?;
         let user_root = File::open(&root).map_err(io_error("open", &root))?;
         let membership = match participant {
-            Participant::Visitor => None,
+            Participant::Client => None,
             Participant::Member => {
                 Some(Membership::enter(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))?)
             }
@@ -227,13 +228,13 @@ impl Domain {
         same && has_services && std::fs::metadata(details).map_or_else(|error| !is_missing(&error), |_| true)
     }
 
-    /// Whether this is still the shared memory that this process has joined. A visitor may stay while the run ends, and
+    /// Whether this is still the shared memory that this process has joined. A client may stay while the run ends, and
     /// even begins again: the run does not wait for it.
     pub(super) fn is_current(&self) -> bool {
         self.is_intact(0)
     }
 
-    /// Makes ports of a visitor by calling `make`, under the run's lock. Returns `None` if the shared memory that this
+    /// Makes ports of a client by calling `make`, under the run's lock. Returns `None` if the shared memory that this
     /// process joined was removed: the run may have begun again with services of the same names, and nobody would free
     /// the ports there after this process's death.
     ///
@@ -241,16 +242,16 @@ impl Domain {
     /// When another process holds the lock for too long, or the lock cannot be used.
     pub(super) fn make_ports<Ports>(&self, make: impl FnOnce() -> Ports) -> Result<Option<Ports>, DomainError> {
         // Files are removed only under this lock.
-        let Some(_lock) = self.lock_as_visitor()? else {
+        let Some(_lock) = self.lock_as_client()? else {
             return Ok(None);
         };
         Ok(self.is_current().then(make))
     }
 
-    /// Drops the ports of a visitor. With the last port of a service, iceoryx2 removes the service's files by their
+    /// Drops the ports of a client. With the last port of a service, iceoryx2 removes the service's files by their
     /// names, which are the same when the run has begun again. So ports of shared memory that was removed are leaked.
     pub(super) fn drop_ports<Ports>(&self, ports: Ports) {
-        let lock = self.lock_as_visitor();
+        let lock = self.lock_as_client();
         if matches!(lock, Ok(Some(_))) && self.is_current() {
             drop(ports);
         } else {
@@ -259,11 +260,11 @@ impl Domain {
     }
 
     /// Takes the run's lock; `None` if there is no such run.
-    fn lock_as_visitor(&self) -> Result<Option<File>, DomainError> {
-        lock_within(&self.directory()?, VISITOR_LOCK_TIMEOUT)
+    fn lock_as_client(&self) -> Result<Option<File>, DomainError> {
+        lock_within(&self.directory()?, CLIENT_LOCK_TIMEOUT)
     }
 
-    /// Whether a process of the run is alive, even if iceoryx2 does not find it. Visitors are not counted.
+    /// Whether a process of the run is alive, even if iceoryx2 does not find it. Clients are not counted.
     pub fn has_members(&self) -> bool {
         matches!(membership::claim(&self.run_id), Ok(Claim::Held))
     }
@@ -397,7 +398,7 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Process ids of the living processes of the run, including stopped ones but not visitors.
+/// Process ids of the living processes of the run, including stopped ones but not clients.
 fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let failed = |cause: String| DomainError::SharedMemory {
         action: "list the processes of",
@@ -412,7 +413,7 @@ fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> 
             NodeState::Dead(_) => false,
             NodeState::Alive(node) => {
                 let name = node.details().as_ref().map(|details| details.name().as_str());
-                name != Some(Participant::Visitor.node_name())
+                name != Some(Participant::Client.node_name())
             }
             // For example, a process that was killed while it joined.
             NodeState::Inaccessible(_) | NodeState::Undefined(_) => {

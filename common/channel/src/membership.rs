@@ -1,5 +1,5 @@
 //! Shows that processes of a run are alive, whatever happens to the run's files below `/tmp`: other programs may tidy
-//! that directory up. Every process of a run, except visitors, holds a shared lock on `shoal_<run>_members` in shared
+//! that directory up. Every process of a run, except clients, holds a shared lock on `shoal_<run>_members` in shared
 //! memory. The run's other files there may be removed only by a process that holds the lock exclusively.
 
 use std::fs::{File, OpenOptions, TryLockError};
