@@ -1,11 +1,11 @@
 //! Films of a policy's evaluation episodes.
 
+mod failure;
 mod ffmpeg;
 mod gif;
 mod paint;
 mod writer;
 
-use std::io;
 use std::path::Path;
 
 use anyhow::{Context, bail};
@@ -17,6 +17,7 @@ use shoal_run::description;
 use shoal_run::evaluation::rollout::Rollout;
 use shoal_run::signals::Interrupt;
 
+use self::failure::FilmFailure;
 use self::writer::{FilmWriter, Pictures};
 
 /// About the greatest number of pictures in a film, over all its episodes. Longer episodes are thinned out.
@@ -84,35 +85,6 @@ pub struct Shown {
     pub episodes: Vec<(f64, usize)>,
     /// How long the film is, in s.
     pub seconds: f64,
-}
-
-/// Why there is no film: its file cannot be written, or something else.
-#[derive(Debug)]
-enum FilmFailure {
-    File(anyhow::Error),
-    Other(anyhow::Error),
-}
-
-impl From<io::Error> for FilmFailure {
-    fn from(error: io::Error) -> Self {
-        Self::File(error.into())
-    }
-}
-
-impl From<::gif::EncodingError> for FilmFailure {
-    fn from(error: ::gif::EncodingError) -> Self {
-        Self::File(error.into())
-    }
-}
-
-impl From<anyhow::Error> for FilmFailure {
-    fn from(error: anyhow::Error) -> Self {
-        if error.is::<::gif::EncodingError>() {
-            Self::File(error)
-        } else {
-            Self::Other(error)
-        }
-    }
 }
 
 /// Plays the episodes and writes their film to `out`, whole or not at all. Calls `progress` with the number of the

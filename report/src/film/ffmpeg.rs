@@ -13,7 +13,7 @@ use shoal_env_server::frame::Image;
 use shoal_run::signals::{self, Interrupt};
 use tempfile::TempDir;
 
-use super::FilmFailure;
+use super::failure::FilmFailure;
 
 /// The program's name.
 const PROGRAM: &str = "ffmpeg";

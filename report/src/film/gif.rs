@@ -6,7 +6,7 @@ use anyhow::Context;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 use shoal_env_server::frame::Image;
 
-use super::FilmFailure;
+use super::failure::FilmFailure;
 
 /// How carefully the colours of a picture with more than 256 are chosen: 1 is best, 30 is fastest.
 const SPEED: i32 = 10;

@@ -8,10 +8,11 @@ use shoal_env_server::frame::{Frame, Image};
 use shoal_run::evaluation::frames::Frames;
 use shoal_run::signals::{self, Interrupt};
 
+use super::Format;
+use super::failure::FilmFailure;
 use super::ffmpeg::Ffmpeg;
 use super::gif::GifEncoder;
 use super::paint::Painter;
-use super::{FilmFailure, Format};
 
 /// Players slow down pictures of a GIF that are shown for less than this many hundredths of a second.
 const SHORTEST_DELAY: f64 = 2.0;
