@@ -1,6 +1,5 @@
 //! The launcher: starts the roles of a run, watches them, writes the records, and ends the roles.
 
-mod child;
 mod cleaner;
 mod end_roles;
 mod incarnations;
@@ -18,6 +17,7 @@ mod progress;
 mod requests;
 mod shares;
 mod stall;
+mod supervised_role;
 mod supervisor;
 
 use std::time::{Duration, Instant};
@@ -134,11 +134,11 @@ pub(crate) fn run(
     options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let ended = run_and_renew(config, run, signals, options);
-    ended.inspect_err(|error| record_failed_start(run, error))
+    ended.inspect_err(|error| record_failure_if_open(run, error))
 }
 
 /// Records that the run has failed, unless a launcher has recorded how it ended.
-fn record_failed_start(run: &LockedRun, error: &anyhow::Error) {
+fn record_failure_if_open(run: &LockedRun, error: &anyhow::Error) {
     if run.check().is_ok()
         && let Ok(Some(outcome)) = RunOutcome::read(run)
         && outcome.state == RunState::Running

@@ -94,7 +94,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, 
         }
         Role::Evaluator => {
             let settings = evaluator::EvaluatorSettings::new(config, run, instance, evaluated_period(config, run)?);
-            Ok(evaluator::evaluate(domain, &settings, stop)?)
+            Ok(evaluator::run(domain, &settings, stop)?)
         }
         Role::Learner => {
             let settings = process::LearnerSettings {
@@ -103,7 +103,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, 
                 run: run.clone(),
                 evaluated_period: evaluated_period(config, run)?,
             };
-            Ok(process::learn(domain, &settings, stop)?)
+            Ok(process::run(domain, &settings, stop)?)
         }
         #[cfg(feature = "remote")]
         Role::Gate => {
@@ -115,7 +115,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, 
                 key: key(&endpoint, &run.path().join(KeyFile::GATE))?,
                 endpoint,
             };
-            Ok(shoal_remote::gate::serve(domain, &settings, stop)?)
+            Ok(shoal_remote::gate::run(domain, &settings, stop)?)
         }
         #[cfg(feature = "remote")]
         Role::Relay => {
@@ -127,7 +127,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, 
                 key: key(&host.endpoint, &run.path().join(KeyFile::JOIN))?,
                 host,
             };
-            Ok(shoal_remote::relay::relay(domain, &settings, stop)?)
+            Ok(shoal_remote::relay::run(domain, &settings, stop)?)
         }
         #[cfg(not(feature = "remote"))]
         Role::Gate | Role::Relay => anyhow::bail!(shoal_remote::NOT_BUILT),
@@ -187,7 +187,7 @@ fn serve(
     let spec = environments.spec().clone();
     let port = EnvironmentPort::open(domain, launch.index, spec, environments.count(), launch.client)?;
     let heartbeat = HeartbeatSender::new(domain, instance)?;
-    Ok(shoal_env_server::server::serve(
+    Ok(shoal_env_server::server::run(
         &mut environments,
         &port,
         launch.seed,

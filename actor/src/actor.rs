@@ -57,7 +57,7 @@ pub struct ActorSettings {
     /// Whether the first policy comes from another run (`--from`).
     starts_with_learned_policy: bool,
     /// The replay file; its commit record shows which chunks have arrived.
-    pub replay: PathBuf,
+    pub replay_file: PathBuf,
 }
 
 impl ActorSettings {
@@ -70,7 +70,7 @@ impl ActorSettings {
             n_step: config.replay.n_step as usize,
             chunk: config.chunk_layout(),
             starts_with_learned_policy: config.run.from.is_some(),
-            replay: run.replay_file(),
+            replay_file: run.replay_file(),
         }
     }
 }
@@ -179,7 +179,7 @@ impl<'a> Actor<'a> {
             ending_since: None,
             faults: 0,
             n_step: NStepTransitions::new(settings.n_step, settings.envs, row),
-            chunk: sender.begin()?,
+            chunk: sender.empty_chunk()?,
             policy_version: 0,
             sender,
             commits,
@@ -257,7 +257,7 @@ impl<'a> Actor<'a> {
         let mut connected = self.send_complete_chunks()?;
         while connected {
             let policy = self.await_policy().map_err(Exit::convert)?;
-            self.heartbeat.begin_work();
+            self.heartbeat.announce_first_step();
             self.act(&policy, &current);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
             let stepped = self.client.step(&self.listener, &self.actions, idle);
@@ -463,7 +463,7 @@ impl<'a> Actor<'a> {
 
     /// Sends the chunk and begins the next one.
     fn send(&mut self) -> Result<(), ChannelError> {
-        let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
+        let chunk = std::mem::replace(&mut self.chunk, self.sender.empty_chunk()?);
         self.sender.send(chunk, self.policy_version)?;
         self.learner.notify();
         self.episodes.send();
@@ -518,7 +518,7 @@ fn wait_for_replay(
     heartbeat: &mut HeartbeatSender,
 ) -> Result<CommitReader, Exit<ActorError>> {
     loop {
-        if let Some(reader) = CommitReader::open_if_ready(&settings.replay)? {
+        if let Some(reader) = CommitReader::open_if_ready(&settings.replay_file)? {
             return Ok(reader);
         }
         if stop.requested() {

@@ -26,7 +26,7 @@ pub(crate) fn connect(
     stop: &Stop,
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
+    let (served, served_envs) = client.spec(listener, || ()).map_err(Exit::convert)?;
     let counts = || (served_envs != envs).then(|| format!("it has {served_envs} environments instead of {envs}"));
     match served.difference(spec).or_else(counts) {
         Some(difference) => Err(Exit::Failed(ActorError::Server { index, difference })),

@@ -92,7 +92,7 @@ fn better_of<E>(
 /// # Errors
 /// When a channel fails, the environment is not the expected one, or the evaluator's state or a policy cannot be read
 /// or written.
-pub fn evaluate(domain: &Domain, settings: &EvaluatorSettings, stop: &Stop) -> Result<(), ActorError> {
+pub fn run(domain: &Domain, settings: &EvaluatorSettings, stop: &Stop) -> Result<(), ActorError> {
     let mut evaluator = match Evaluator::new(domain, settings, stop) {
         Ok(evaluator) => evaluator,
         Err(exit) => return exit.into_result(),

@@ -168,7 +168,7 @@ fn round_trip(
 ) -> anyhow::Result<f64> {
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, budget.stop.clone())?;
-    client.describe(&listener, || ()).map_err(interrupted)?;
+    client.spec(&listener, || ()).map_err(interrupted)?;
     client
         .reset(&listener, ResetRequest::Next, || ())
         .map_err(interrupted)?;
@@ -229,7 +229,7 @@ fn chunks(
         budget.check()?;
         let before = Instant::now();
         for _ in 0..window {
-            let mut chunk = sender.begin()?;
+            let mut chunk = sender.empty_chunk()?;
             rows.chunks_exact(row.width())
                 .for_each(|one| chunk.push(&row.read(one)));
             sender.send(chunk, 0)?;

@@ -105,7 +105,7 @@ fn round_trips(
         Err(Exit::Stopped) => budget.check(),
         Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
-    ask(&|| client.describe(&listener, || ()).map(|_| ()))?;
+    ask(&|| client.spec(&listener, || ()).map(|_| ()))?;
     ask(&|| client.reset(&listener, ResetRequest::Next, || ()).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];

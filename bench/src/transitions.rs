@@ -123,7 +123,7 @@ fn move_rows(
                 learner.check()?;
             }
             waited.map_err(super::measurement::interrupted)?;
-            let mut chunk = sender.begin()?;
+            let mut chunk = sender.empty_chunk()?;
             for numbers in numbers.chunks_exact(row.width()) {
                 chunk.push(&row.read(numbers));
             }

@@ -265,7 +265,7 @@ mod tests {
             let (spec, behaviour) = fits.unwrap();
             for normalised in [false, true] {
                 let layout = behaviour.clone().normalising(normalised).into_policy().layout();
-                let (_, policy) = algorithm.settings().learned(spec).normalising(normalised).policy;
+                let (_, policy) = algorithm.settings().learned_shapes(spec).normalising(normalised).policy;
                 assert_eq!(policy.parameters(), layout.parameters(), "{}", algorithm.name());
             }
         }

@@ -227,8 +227,8 @@ impl Config {
     }
 
     /// The networks or tables that are learned.
-    pub fn learned(&self) -> LearnedShapes {
-        let learned = self.algorithm.settings().learned(&self.spec);
+    pub fn learned_shapes(&self) -> LearnedShapes {
+        let learned = self.algorithm.settings().learned_shapes(&self.spec);
         learned.normalising(self.observation.normalise)
     }
 

@@ -130,7 +130,7 @@ fn serve_until_stopped(
             incarnation: *incarnation,
         };
         let heartbeat = HeartbeatSender::new(&domain, instance)?;
-        server::serve(&mut environments, &port, *seed, heartbeat, &stop)
+        server::run(&mut environments, &port, *seed, heartbeat, &stop)
     })();
     let left = domain.leave();
     served.map_err(in_words)?;

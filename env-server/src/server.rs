@@ -11,7 +11,7 @@ use crate::vector::{Reset, VectorEnvironment};
 ///
 /// # Errors
 /// When the channel fails. An invalid request is refused and logged; it is not an error.
-pub fn serve(
+pub fn run(
     environments: &mut VectorEnvironment,
     port: &EnvironmentPort,
     seed: u64,
@@ -38,7 +38,7 @@ pub fn serve(
                     },
                     _ => Reset::Next,
                 };
-                heartbeat.begin_work();
+                heartbeat.announce_first_step();
                 let refused = request
                     .respond(|_, blocks| environments.reset(reset, blocks.observations))?
                     .err();
@@ -46,7 +46,7 @@ pub fn serve(
                 refused
             }
             Some(RequestKind::Step) if started => {
-                heartbeat.begin_work();
+                heartbeat.announce_first_step();
                 let refused = request
                     .respond(|actions, blocks| environments.step(actions, blocks))?
                     .err();
@@ -64,8 +64,8 @@ pub fn serve(
                 None
             }
             Some(RequestKind::Restore) => {
-                let words = request.words();
-                heartbeat.begin_work();
+                let words = request.snapshot_words();
+                heartbeat.announce_first_step();
                 let refused = request
                     .respond(|_, blocks| environments.restore(&words, blocks.observations))?
                     .err();
@@ -112,7 +112,7 @@ mod tests {
                 incarnation: 0,
             };
             let heartbeat = HeartbeatSender::new(&domain, instance).unwrap();
-            serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
+            run(&mut environments, &port, 1, heartbeat, &stop).unwrap();
             drop(port);
             domain.leave().unwrap();
         })

@@ -38,7 +38,7 @@
 //! let mut sender = handshake
 //!     .wait(&commits, &listener, &Stop::default(), || {})
 //!     .map_err(|exit| exit.to_string())?;
-//! let mut chunk = sender.begin()?;
+//! let mut chunk = sender.empty_chunk()?;
 //! let (s, a, s_next) = ([0.0, 1.0], [0.5], [0.1, 0.9]);
 //! chunk.push(&Transition { s: &s, a: &a, r: -1.0, discount: 0.99, s_next: &s_next, last: false });
 //! sender.send(chunk, 1)?;

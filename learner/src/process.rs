@@ -30,7 +30,7 @@ pub use self::sizes::{SizeError, disk_bytes, replay_layout};
 ///
 /// # Errors
 /// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
-pub fn learn(domain: &Domain, settings: &LearnerSettings, stop: &Stop) -> Result<(), LearnerError> {
+pub fn run(domain: &Domain, settings: &LearnerSettings, stop: &Stop) -> Result<(), LearnerError> {
     let mut learner = Learner::new(domain, settings, stop)?;
     let ended = match settings.config.run.mode {
         Mode::Free => free::run(&mut learner),

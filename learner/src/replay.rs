@@ -1,7 +1,7 @@
 //! The replay: a ring of rows in a mapped file. Only the learner writes it, and it samples rows in place.
 //!
 //! Rows are numbered in the order they are committed, from 0, for the life of the file. A chunk becomes part of the
-//! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`ReservedChunk::fill`],
+//! replay in three steps that cannot be taken out of order: [`Replay::reserve`], [`ReservedChunk::fill`],
 //! [`FilledChunk::commit`]. A process that is killed between any two instructions leaves the last committed state.
 //! `docs/REPLAY_FORMAT.md` has the layout, the invariants and what survives a power loss.
 //!

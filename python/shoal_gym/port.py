@@ -149,7 +149,7 @@ class Port:
         except iox2.NotifierNotifyError:
             pass
 
-    def begin_work(self) -> None:
+    def announce_first_step(self) -> None:
         """Reports that the environments are about to do something that this process may not survive: at once if they have not
         made a step yet, so that the launcher can tell a process that dies in its first step from one that was waiting.
         """

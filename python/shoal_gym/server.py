@@ -27,7 +27,7 @@ def serve(environments: Environments, port: Port) -> None:
     while True:
         request = port.next_request()
         if request.user_header().contents.kind != RequestKind.DESCRIBE:
-            port.begin_work()
+            port.announce_first_step()
         server.answer(request)
         port.notify()
         port.count(server.stepped())

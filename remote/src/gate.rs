@@ -183,7 +183,7 @@ struct Gate<'a> {
 ///
 /// # Errors
 /// When a channel fails, or the endpoint cannot be used.
-pub fn serve(domain: &Domain, settings: &GateSettings, stop: &Stop) -> Result<(), GateError> {
+pub fn run(domain: &Domain, settings: &GateSettings, stop: &Stop) -> Result<(), GateError> {
     let Some(mut gate) = Gate::new(domain, settings, stop)? else {
         return Ok(());
     };

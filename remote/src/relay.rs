@@ -185,7 +185,7 @@ struct Relay<'a> {
 ///
 /// # Errors
 /// When a channel fails, or this host is no longer admitted.
-pub fn relay(domain: &Domain, settings: &RelaySettings, stop: &Stop) -> Result<(), RelayError> {
+pub fn run(domain: &Domain, settings: &RelaySettings, stop: &Stop) -> Result<(), RelayError> {
     Relay::new(domain, settings, stop)?.run()
 }
 

@@ -183,7 +183,7 @@ impl Demonstrations {
     }
 
     /// Writes the replay and the learner's state before its first update.
-    pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<DatasetOrigin> {
+    pub(crate) fn write(&self, run: &RunDir, config: &Config) -> anyhow::Result<DatasetOrigin> {
         let mut replay = Replay::create(&run.replay_file(), &replay_layout(config))?;
         let rows = replay.begin_with_rows(&self.rows(config.algorithm.gamma() as f32))?;
         let begun = Counters {

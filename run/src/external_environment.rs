@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use shoal_common::channel::environment::{
-    EnvironmentClient, EnvironmentResponse, ResetRequest, ResponseFault, StepResult, describe,
+    EnvironmentClient, EnvironmentResponse, ResetRequest, ResponseFault, StepResult, spec,
 };
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
@@ -30,7 +30,7 @@ use self::launch::cannot_start;
 pub use self::launch::{LaunchSpec, serve_with, server_iceoryx2_config};
 use crate::child_process::{ChildProcess, tied, wait_for_any};
 use crate::external_environment::server_location::LaunchContext;
-use crate::signals::{Interrupt, describe as describe_signal};
+use crate::signals::{Interrupt, describe};
 
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
@@ -80,7 +80,7 @@ impl Drop for LeaveOnDrop {
 }
 
 impl ExternalEnvironment {
-    /// Starts the environment's server with this number of environments and asks for their description. `seed`
+    /// Starts the environment's server with this number of environments and asks for their spaces. `seed`
     /// determines the start states of its evaluation episodes.
     ///
     /// # Errors
@@ -248,7 +248,7 @@ impl ExternalEnvironment {
 
     fn unanswered<T>(&mut self, asked: Instant) -> anyhow::Result<T> {
         if let Some(signal) = self.interrupt.signal() {
-            bail!("ended by {}", describe_signal(signal));
+            bail!("ended by {}", describe(signal));
         }
         if asked.elapsed() >= self.limit {
             bail!(
@@ -297,7 +297,7 @@ fn open(
         .with_context(|| cannot_start(&command))?;
     let has_answered = Stop::default();
     let stop = stop_when_it_ends(&program, has_answered.clone(), environment)?;
-    let described = describe(domain, launch.index, &listener, stop.clone(), || {
+    let described = spec(domain, launch.index, &listener, stop.clone(), || {
         if interrupt.signal().is_some() {
             stop.request();
         }
@@ -306,7 +306,7 @@ fn open(
     let (spec, environments) = match checked(described, &mut program).map_err(with_advice)? {
         Some(described) => described,
         None => match interrupt.signal() {
-            Some(signal) => bail!("ended by {}", describe_signal(signal)),
+            Some(signal) => bail!("ended by {}", describe(signal)),
             None => bail!(
                 "{} did not describe itself within {} s; {}",
                 environment.name,

@@ -100,12 +100,12 @@ impl Origin {
 
 /// What a new run is to begin with.
 #[derive(Debug)]
-pub(crate) enum Beginning {
-    Run(Box<Predecessor>),
+pub(crate) enum PendingOrigin {
+    Run(Box<SourceRun>),
     Dataset(Demonstrations),
 }
 
-impl Beginning {
+impl PendingOrigin {
     /// Checks that a run with this configuration can begin with it, and adds the number of initial rows to the run's
     /// steps.
     ///
@@ -113,7 +113,7 @@ impl Beginning {
     /// When networks or rows do not fit. The message says what differs.
     pub(crate) fn prepare(&self, config: &mut Config) -> anyhow::Result<()> {
         let rows = match self {
-            Self::Run(predecessor) => predecessor.check(config)?,
+            Self::Run(source) => source.check(config)?,
             Self::Dataset(demonstrations) => Some(demonstrations.check(config)?),
         };
         let Some(rows) = rows else { return Ok(()) };
@@ -127,12 +127,12 @@ impl Beginning {
     ///
     /// # Errors
     /// When a file cannot be written.
-    pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
+    pub(crate) fn write(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
         let checkpoints = run.checkpoints();
         std::fs::create_dir_all(&checkpoints).with_context(|| format!("cannot create {}", checkpoints.display()))?;
         let origin = match self {
-            Self::Run(predecessor) => Origin::Run(predecessor.begin(run, config)?),
-            Self::Dataset(demonstrations) => Origin::Dataset(demonstrations.begin(run, config)?),
+            Self::Run(source) => Origin::Run(source.write(run, config)?),
+            Self::Dataset(demonstrations) => Origin::Dataset(demonstrations.write(run, config)?),
         };
         origin.store(&run.origin())?;
         Ok(origin)
@@ -141,7 +141,7 @@ impl Beginning {
     /// A warning, if one is needed, about the rows that a run of this configuration begins with.
     pub(crate) fn warning(&self, config: &Config) -> Option<String> {
         match self {
-            Self::Run(predecessor) => predecessor.warning(config),
+            Self::Run(source) => source.warning(config),
             Self::Dataset(demonstrations) => demonstrations.warning(config),
         }
     }
@@ -149,7 +149,7 @@ impl Beginning {
 
 /// A run to begin with.
 #[derive(Debug)]
-pub(crate) struct Predecessor {
+pub(crate) struct SourceRun {
     run: RunDir,
     config: Config,
     checkpoint: Checkpoint,
@@ -157,7 +157,7 @@ pub(crate) struct Predecessor {
     replay: Option<(Replay, LockedRun)>,
 }
 
-impl Predecessor {
+impl SourceRun {
     /// Opens the run in this directory. It may be running, unless its replay is asked for.
     ///
     /// # Errors
@@ -222,7 +222,7 @@ impl Predecessor {
             ));
         }
         // Networks of one shape may have inputs or outputs of another meaning: normalised, or of dueling heads.
-        let shapes = |config: &Config| (config.learned(), config.policy_layout().ok());
+        let shapes = |config: &Config| (config.learned_shapes(), config.policy_layout().ok());
         if shapes(old) == shapes(new) {
             return Ok(());
         }
@@ -287,7 +287,7 @@ impl Predecessor {
         Ok(())
     }
 
-    fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<RunOrigin> {
+    fn write(&self, run: &RunDir, config: &Config) -> anyhow::Result<RunOrigin> {
         // The rows of the old replay that the new one begins with.
         let copied = match &self.replay {
             None => 0..0,
@@ -300,9 +300,9 @@ impl Predecessor {
         };
         let rows = copied.end - copied.start;
         let Checkpoint { counters, arrays } = &self.checkpoint;
-        let weights = registry::weights(config);
+        let weight_names = registry::weight_names(config);
         let fresh = registry::new(config)?;
-        let state = registry::inherited(&*fresh, &weights, SavedState::from(arrays.clone()), copied)?;
+        let state = registry::inherited(&*fresh, &weight_names, SavedState::from(arrays.clone()), copied)?;
         let borrowed: Vec<(&str, &[f32])> = state
             .iter()
             .map(|(name, numbers)| (*name, numbers.as_slice()))

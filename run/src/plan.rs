@@ -31,7 +31,7 @@ pub use self::source::{SettingSource, SettingSources};
 
 use crate::demonstrations::Demonstrations;
 use crate::external_environment::server_location::ServerLocation;
-use crate::origin::{Beginning, Origin, Predecessor};
+use crate::origin::{Origin, PendingOrigin, SourceRun};
 use crate::preflight;
 use crate::records::start::StartRecord;
 use crate::signals::Interrupt;
@@ -73,16 +73,16 @@ impl Plan {
             description,
             ..
         } = resolve_all(what, overrides, Interrupt::default())?;
-        let beginning = match (&overrides.from, &overrides.demonstrations) {
+        let pending_origin = match (&overrides.from, &overrides.demonstrations) {
             (Some(from), _) => {
-                let predecessor = Predecessor::open(from, overrides.with_replay)?;
-                Some(Beginning::Run(Box::new(predecessor)))
+                let source = SourceRun::open(from, overrides.with_replay)?;
+                Some(PendingOrigin::Run(Box::new(source)))
             }
-            (None, Some(dataset)) => Some(Beginning::Dataset(Demonstrations::read(dataset, &config)?)),
+            (None, Some(dataset)) => Some(PendingOrigin::Dataset(Demonstrations::read(dataset, &config)?)),
             (None, None) => None,
         };
-        if let Some(beginning) = &beginning {
-            beginning.prepare(&mut config)?;
+        if let Some(pending) = &pending_origin {
+            pending.prepare(&mut config)?;
         }
         let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
         preflight::check(&config, &RunDir::at(&place))?;
@@ -94,14 +94,14 @@ impl Plan {
             let locked = run.lock()?;
             let config = fill(&run, &config, description.as_ref())?;
             StartRecord::of_this_process().write(run.path())?;
-            let origin = beginning.as_ref().map(|beginning| beginning.begin(&run, &config));
+            let origin = pending_origin.as_ref().map(|pending| pending.write(&run, &config));
             Ok((locked, config, origin.transpose()?))
         };
         let (locked, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
             let _ = run.remove();
         })?;
-        let of_rows = beginning.and_then(|beginning| beginning.warning(&config));
+        let of_rows = pending_origin.and_then(|pending| pending.warning(&config));
         Ok(Self {
             warnings: warning(&config).into_iter().chain(of_rows).collect(),
             config,

@@ -17,7 +17,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::client::{RunClient, is_in_final_evaluation};
 use shoal_run::suite::{self, Suite};
 
-use super::training::OutputMode;
+use super::training::OutputOptions;
 
 /// The hidden command that begins a session without a terminal, and then executes this program with the given
 /// arguments.
@@ -44,7 +44,7 @@ struct DetachedJson<'a> {
 ///
 /// # Errors
 /// When the run is running already, or does not start in time.
-pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
+pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputOptions) -> anyhow::Result<ExitCode> {
     // A run that is running already is refused here. Later its launcher would look like the new one.
     drop(RunDir::open(path)?.lock()?);
     let of_environment = RunClient::open(path)?.config.environment.start_seconds;
@@ -62,7 +62,7 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
 ///
 /// # Errors
 /// When a process works on it already, or the new one does not begin in time.
-pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
+pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputOptions) -> anyhow::Result<ExitCode> {
     drop(suite::lock(path)?);
     let begun = Instant::now();
     let is_at_work = || {
@@ -80,7 +80,7 @@ pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputM
 fn start_detached(
     path: &Path,
     (arguments, timeout): (&[OsString], Duration),
-    output: &OutputMode,
+    output: &OutputOptions,
     is_at_work: impl Fn() -> anyhow::Result<bool>,
     how_to_end: impl Fn(&str, u32) -> String,
 ) -> anyhow::Result<ExitCode> {

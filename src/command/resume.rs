@@ -23,8 +23,7 @@ use shoal_run::suite::{Suite, configuration};
 use shoal_run::usage::UsageError;
 
 use super::listen::ListenArgs;
-use super::training::OutputMode;
-use super::training::run_training;
+use super::training::{OutputOptions, run_training};
 use super::{detach, suite};
 use crate::{completion, launcher};
 
@@ -45,7 +44,7 @@ pub(crate) struct ResumeArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) jobs: Option<u16>,
     #[command(flatten)]
-    pub(crate) output: OutputMode,
+    pub(crate) output: OutputOptions,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
 }

@@ -23,13 +23,13 @@ use shoal_run::usage::UsageError;
 
 use super::detach;
 use super::train::TrainArgs;
-use super::training::OutputMode;
+use super::training::OutputOptions;
 
 /// How many runs at a time, and what is printed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SuiteOptions<'a> {
     pub(crate) jobs: Option<u16>,
-    pub(crate) output: &'a OutputMode,
+    pub(crate) output: &'a OutputOptions,
 }
 
 /// The output of `--json`.
@@ -168,7 +168,7 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
 }
 
 /// Prints what came out: a line for each setting, and which is best; with `--json` an object about the runs.
-fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Result<()> {
+fn report(suite: &Suite, directory: &Path, output: &OutputOptions) -> anyhow::Result<()> {
     let here = directory.display();
     if !output.quiet {
         let runs = suite

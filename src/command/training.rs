@@ -28,7 +28,7 @@ use crate::launcher::{self, RunEnd, RunOptions, TrainingOutcome};
 
 /// The output options of a training.
 #[derive(Args, Clone, Debug, Default)]
-pub(crate) struct OutputMode {
+pub(crate) struct OutputOptions {
     /// No live line and no table.
     #[arg(long)]
     pub(crate) quiet: bool,
@@ -64,7 +64,7 @@ struct TrainingJson {
 pub(crate) fn run_training(
     config: Config,
     run: &LockedRun,
-    output: &OutputMode,
+    output: &OutputOptions,
     listen: &ListenArgs,
 ) -> anyhow::Result<ExitCode> {
     let gate = listen.prepare(&config, run)?;
@@ -82,7 +82,7 @@ pub(crate) fn run_training(
 fn train_and_report(
     config: Config,
     run: &LockedRun,
-    output: &OutputMode,
+    output: &OutputOptions,
     options: RunOptions,
 ) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;

@@ -8,7 +8,7 @@ use shoal_common::run_dir::{LockedRun, RunDir};
 use shoal_common::stop::GRACE;
 use shoal_run::records::outcome::{OutcomeReason, RunOutcome, RunState};
 
-use super::record_failed_start;
+use super::record_failure_if_open;
 
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_TIMEOUT: Duration = GRACE.saturating_add(Duration::from_secs(5));
@@ -29,7 +29,7 @@ pub(crate) fn wait_for_predecessors(run_id: &str, run: &LockedRun) -> anyhow::Re
     let waited = Domain::wait_for_earlier_processes(run_id, PREDECESSORS_TIMEOUT);
     waited
         .map_err(|error| name_original_run(error, run))
-        .inspect_err(|error| record_failed_start(run, error))
+        .inspect_err(|error| record_failure_if_open(run, error))
 }
 
 /// Waits as [`wait_for_predecessors`] does, but records nothing. If this directory is a copy of another run, the roles

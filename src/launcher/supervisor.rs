@@ -27,13 +27,13 @@ use tracing_subscriber::filter::LevelFilter;
 use self::actors::ActorSet;
 use self::cleaning::Cleaning;
 use self::faults::Faults;
-use super::child::{Child, RestartDecision};
 use super::incarnations::Incarnations;
 use super::joined_hosts::JoinedHosts;
 use super::local_actors;
 use super::log::Log;
 use super::process::{Process, describe_exit, name};
 use super::stall::StallDetector;
+use super::supervised_role::{RestartDecision, SupervisedRole};
 use crate::log_level::log_level;
 
 /// A start that takes longer is reported to the user.
@@ -68,7 +68,7 @@ pub(super) enum SupervisedHost {
 /// All processes of a run on one host.
 #[derive(Debug)]
 pub(super) struct Supervisor {
-    children: Vec<Child>,
+    roles: Vec<SupervisedRole>,
     services: Services,
     /// Whether the learner is on this host.
     is_learner_host: bool,
@@ -115,15 +115,15 @@ impl Supervisor {
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
-        let (children, actors) = match host {
+        let (roles, actors) = match host {
             SupervisedHost::OfLearner { gate } => {
                 services.create_environment(domain, server)?;
-                let mut children = vec![
-                    Child::new(Role::Learner, 0),
-                    Child::new(Role::EnvServer, server),
-                    Child::new(Role::Evaluator, 0).with_server(server),
+                let mut roles = vec![
+                    SupervisedRole::new(Role::Learner, 0),
+                    SupervisedRole::new(Role::EnvServer, server),
+                    SupervisedRole::new(Role::Evaluator, 0).with_server(server),
                 ];
-                children.extend(gate.then(|| Child::new(Role::Gate, 0)));
+                roles.extend(gate.then(|| SupervisedRole::new(Role::Gate, 0)));
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 let count = config.actors.count;
                 let actors = match lockstep {
@@ -134,12 +134,12 @@ impl Supervisor {
                         actors
                     }
                 };
-                (children, actors)
+                (roles, actors)
             }
-            SupervisedHost::Joined { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            SupervisedHost::Joined { actors } => (vec![SupervisedRole::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
-            children,
+            roles,
             services,
             is_learner_host,
             window: config.actors.window,
@@ -176,8 +176,8 @@ impl Supervisor {
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.create_wanted_services(domain)?;
         self.incarnations
-            .reserve((self.children.len() + self.missing().len()) as u64)?;
-        (0..self.children.len()).try_for_each(|i| self.start(i).map(drop))?;
+            .reserve((self.roles.len() + self.missing().len()) as u64)?;
+        (0..self.roles.len()).try_for_each(|i| self.start(i).map(drop))?;
         self.start_missing(domain)
     }
 
@@ -204,25 +204,27 @@ impl Supervisor {
     /// When the counter of incarnations cannot be written, or the system refuses.
     fn start_now(&mut self, i: usize) -> anyhow::Result<()> {
         let incarnation = self.incarnations.take(1)?;
-        let child = &mut self.children[i];
-        child.instance.incarnation = incarnation;
-        let source = match child.instance.role {
+        let supervised = &mut self.roles[i];
+        supervised.instance.incarnation = incarnation;
+        let source = match supervised.instance.role {
             Role::EnvServer => self.server_output,
             _ => OutputSource::Shoal,
         };
-        let process = Process::start(child.instance, &self.run, &self.log, source)?;
-        self.log
-            .note(&name(child.instance), &format!("started as process {}", process.pid()));
-        child.begin(process);
+        let process = Process::start(supervised.instance, &self.run, &self.log, source)?;
+        self.log.note(
+            &name(supervised.instance),
+            &format!("started as process {}", process.pid()),
+        );
+        supervised.begin(process);
         Ok(())
     }
 
     fn handle_refused_start(&mut self, i: usize, error: anyhow::Error) -> anyhow::Result<()> {
-        let child = &mut self.children[i];
-        let name = name(child.instance);
-        match child.handle_refused_start(self.give_up_after) {
+        let supervised = &mut self.roles[i];
+        let name = name(supervised.instance);
+        match supervised.handle_refused_start(self.give_up_after) {
             RestartDecision::Restart(pause) => {
-                child.restart_at = Instant::now() + pause;
+                supervised.restart_at = Instant::now() + pause;
                 self.log.note(&name, &format!("{error:#}; trying again in {pause:?}"));
                 Ok(())
             }
@@ -248,24 +250,24 @@ impl Supervisor {
     /// When it cannot be started.
     pub(super) fn restart_if_dead(&mut self, role: Role, domain: &Domain) -> anyhow::Result<bool> {
         self.reap(|which| which == role);
-        let is_dead = |child: &Child| child.is(role, 0) && child.process.is_none();
-        let Some(i) = self.children.iter().position(is_dead) else {
+        let is_dead = |supervised: &SupervisedRole| supervised.is(role, 0) && supervised.process.is_none();
+        let Some(i) = self.roles.iter().position(is_dead) else {
             return Ok(false);
         };
         // If files of the run are missing, the clean-up and the new process would find those of another run, or none.
         if role == Role::Learner && self.learner_done || !domain.is_intact(self.services.count()) {
             return Ok(false);
         }
-        if let Some(status) = self.children[i].ended.take() {
+        if let Some(status) = self.roles[i].ended.take() {
             self.log.note(
-                &name(self.children[i].instance),
+                &name(self.roles[i].instance),
                 &format!("{}; restarting it", describe_exit(status)),
             );
             self.note_incident(i, kind_of_end(status), describe_exit(status));
         }
         self.cleaning.clean(domain, &self.services, &self.log);
         self.start_now(i)?;
-        self.children[i].restarts += 1;
+        self.roles[i].restarts += 1;
         if role == Role::Learner {
             self.unsaved_learner = None;
         }
@@ -275,26 +277,28 @@ impl Supervisor {
 
     /// Records a heartbeat.
     pub(super) fn record(&mut self, heartbeat: &Heartbeat) {
-        let child = self.children.iter_mut().find(|child| {
+        let supervised = self.roles.iter_mut().find(|it| {
             let RoleInstance {
                 role,
                 index,
                 incarnation,
-            } = child.instance;
+            } = it.instance;
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
-        let Some(child) = child else { return };
-        let faults = heartbeat.faults.saturating_sub(child.faults());
-        let (client, server) = (name(child.instance), child.server());
-        if let Some(after) = child.record(heartbeat) {
-            self.log
-                .note(&name(child.instance), &format!("ready after {} ms", after.as_millis()));
+        let Some(supervised) = supervised else { return };
+        let faults = heartbeat.faults.saturating_sub(supervised.faults());
+        let (client, server) = (name(supervised.instance), supervised.server());
+        if let Some(after) = supervised.record(heartbeat) {
+            self.log.note(
+                &name(supervised.instance),
+                &format!("ready after {} ms", after.as_millis()),
+            );
         }
         if let Some(index) = server {
             // A heartbeat may claim any number.
             (0..faults.min(self.faults.most)).for_each(|_| self.note_fault(&client, index));
         }
-        if !self.all_ready && self.children.iter().all(Child::is_ready) {
+        if !self.all_ready && self.roles.iter().all(SupervisedRole::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
@@ -302,35 +306,35 @@ impl Supervisor {
 
     /// The activity of a role: that of its first process with a heartbeat.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
-        let mut of_role = self.children.iter().filter(|child| child.instance.role == role);
-        of_role.find_map(Child::activity)
+        let mut of_role = self.roles.iter().filter(|it| it.instance.role == role);
+        of_role.find_map(SupervisedRole::activity)
     }
 
     /// Whether the only process of this role runs and is ready.
     pub(super) fn is_ready(&self, role: Role) -> bool {
-        let mut children = self.children.iter();
-        children.any(|child| child.is(role, 0) && child.process.is_some() && child.is_ready())
+        let mut roles = self.roles.iter();
+        roles.any(|it| it.is(role, 0) && it.process.is_some() && it.is_ready())
     }
 
     /// Total number of restarts.
     pub(super) fn restarts(&self) -> u32 {
-        self.children.iter().map(|child| child.restarts).sum()
+        self.roles.iter().map(|it| it.restarts).sum()
     }
 
     /// The status of all processes. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
-        let mut children: Vec<_> = self.children.iter().collect();
-        children.sort_by_key(|child| (std::cmp::Reverse(child.instance.role), child.instance.index));
-        children.into_iter().map(|child| child.status(newest)).collect()
+        let mut roles: Vec<_> = self.roles.iter().collect();
+        roles.sort_by_key(|it| (std::cmp::Reverse(it.instance.role), it.instance.index));
+        roles.into_iter().map(|it| it.status(newest)).collect()
     }
 
     /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes. Returns whether one of them
     /// has happened.
     pub(super) fn sleep(&mut self, signals: &Signals, control: &ControlPort, most: Duration) -> bool {
         let exits = self
-            .children
+            .roles
             .iter()
-            .filter_map(|child| child.process.as_ref()?.exit_descriptor());
+            .filter_map(|it| it.process.as_ref()?.exit_descriptor());
         let wakers: Vec<_> = exits.chain([signals.as_fd(), control.as_fd()]).collect();
         let woken = wait_for_any(&wakers, most);
         // So that the same events do not wake it again.
@@ -341,25 +345,25 @@ impl Supervisor {
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn time_to_next_task(&self) -> Duration {
-        let missing = |child: &&Child| child.process.is_none() && self.actors.is_wanted(child);
+        let missing = |supervised: &&SupervisedRole| supervised.process.is_none() && self.actors.is_wanted(supervised);
         let now = Instant::now();
-        let restarts = self.children.iter().filter(missing);
+        let restarts = self.roles.iter().filter(missing);
         restarts
-            .map(|child| child.restart_at.saturating_duration_since(now))
+            .map(|it| it.restart_at.saturating_duration_since(now))
             .fold(self.cleaning.time_to_next(), Duration::min)
     }
 
     /// Collects the exit statuses of ended processes. Their last reports are read before [`maintain`](Self::maintain)
     /// handles the ends.
     fn collect_exits(&mut self) {
-        for child in self.children.iter_mut().filter(|child| child.ended.is_none()) {
-            child.ended = child.process.as_mut().and_then(Process::exit_status);
+        for supervised in self.roles.iter_mut().filter(|it| it.ended.is_none()) {
+            supervised.ended = supervised.process.as_mut().and_then(Process::exit_status);
         }
     }
 
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
-        let ended = self.children.iter().any(|child| child.ended.is_some());
+        let ended = self.roles.iter().any(|it| it.ended.is_some());
         // Checked before anything is cleaned up or started: without the run's files, both would find those of another
         // run, or none.
         if (ended || self.cleaning.is_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
@@ -372,7 +376,7 @@ impl Supervisor {
         } else {
             !self.cleaning.is_due() || self.cleaning.clean_if_needed(domain, &self.services, &self.log)
         };
-        for i in 0..self.children.len() {
+        for i in 0..self.roles.len() {
             if self.maintain_one(i)? {
                 return Ok(RunCondition::LearnerDone);
             }
@@ -386,8 +390,8 @@ impl Supervisor {
         })
     }
 
-    fn learner(&self) -> Option<&Child> {
-        self.children.iter().find(|child| child.instance.role == Role::Learner)
+    fn learner(&self) -> Option<&SupervisedRole> {
+        self.roles.iter().find(|it| it.instance.role == Role::Learner)
     }
 
     /// Whether the learner's end has been observed, and it was the planned one.
@@ -398,18 +402,18 @@ impl Supervisor {
 
     /// Returns whether this is the learner, and it is done.
     fn maintain_one(&mut self, i: usize) -> anyhow::Result<bool> {
-        if let Some(status) = self.children[i].ended.take()
+        if let Some(status) = self.roles[i].ended.take()
             && self.handle_end(i, status)?
         {
             return Ok(true);
         }
-        let is_wanted = self.actors.is_wanted(&self.children[i]);
-        let child = &mut self.children[i];
-        if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
+        let is_wanted = self.actors.is_wanted(&self.roles[i]);
+        let supervised = &mut self.roles[i];
+        if supervised.process.is_none() && is_wanted && Instant::now() >= supervised.restart_at {
             // A process that retired and is wanted again did not fail: this start is no restart.
-            let restarts = child.restarts + u32::from(!child.is_retiring);
+            let restarts = supervised.restarts + u32::from(!supervised.is_retiring);
             if self.start(i)? {
-                self.children[i].restarts = restarts;
+                self.roles[i].restarts = restarts;
                 self.note_incident(i, IncidentKind::Restarted, String::new());
             }
         }
@@ -418,27 +422,27 @@ impl Supervisor {
 
     /// Returns whether this is the learner, and it is done.
     fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<bool> {
-        let child = &mut self.children[i];
-        let name = name(child.instance);
+        let supervised = &mut self.roles[i];
+        let name = name(supervised.instance);
         self.log.write_left_out(&name);
-        if child.instance.role == Role::Learner && status.success() {
-            child.process = None;
+        if supervised.instance.role == Role::Learner && status.success() {
+            supervised.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
             return Ok(true);
         }
-        if child.is_retiring {
-            child.process = None;
-            child.restart_at = Instant::now();
+        if supervised.is_retiring {
+            supervised.process = None;
+            supervised.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", describe_exit(status)));
             self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(false);
         }
-        let decision = child.handle_end(status, self.give_up_after);
+        let decision = supervised.handle_end(status, self.give_up_after);
         self.note_incident(i, kind_of_end(status), describe_exit(status));
         match decision {
             RestartDecision::Restart(pause) => {
-                self.children[i].restart_at = Instant::now() + pause;
+                self.roles[i].restart_at = Instant::now() + pause;
                 let when = if pause.is_zero() {
                     "at once".to_owned()
                 } else {
@@ -467,15 +471,15 @@ impl Supervisor {
 
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
     fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
-        let stalled = stalls.find(&mut self.children, self.cleaning.take_time());
+        let stalled = stalls.find(&mut self.roles, self.cleaning.take_time());
         let mut messages = Vec::new();
         for (i, why) in stalled {
-            let child = &mut self.children[i];
+            let supervised = &mut self.roles[i];
             messages.push(format!(
                 "{} makes no progress: {why}; it is replaced",
-                name(child.instance)
+                name(supervised.instance)
             ));
-            if let Some(process) = &mut child.process {
+            if let Some(process) = &mut supervised.process {
                 process.kill();
             }
             self.note_incident(i, IncidentKind::Stalled, why.into());
@@ -487,35 +491,36 @@ impl Supervisor {
     /// starting. An environment's program that is not ready in time is ended, which counts as a failure.
     fn report_slow(&mut self, stalls: &StallDetector) -> Vec<String> {
         let mut said = Vec::new();
-        for (i, silent) in stalls.slow_servers(&self.children) {
-            let child = &mut self.children[i];
-            if child.mark_reported_slow() {
-                let (name, seconds) = (name(child.instance), silent.as_secs());
+        for (i, silent) in stalls.slow_servers(&self.roles) {
+            let supervised = &mut self.roles[i];
+            if supervised.mark_reported_slow() {
+                let (name, seconds) = (name(supervised.instance), silent.as_secs());
                 said.push(format!(
                     "{name} has spent {seconds} s in one step or reset of its environments; it is not interrupted"
                 ));
             }
         }
-        for child in &mut self.children {
-            let Some(starting) = child.starting_for() else { continue };
+        for supervised in &mut self.roles {
+            let Some(starting) = supervised.starting_for() else {
+                continue;
+            };
             let limit = self
                 .server_start_limit
-                .filter(|_| child.instance.role == Role::EnvServer);
+                .filter(|_| supervised.instance.role == Role::EnvServer);
             if limit.is_some_and(|limit| starting >= limit) {
                 let text = "is not ready within environment.start_seconds and is ended";
-                self.log.note(&name(child.instance), text);
-                child.kill_slow_start();
-            } else if starting >= SLOW_START && child.mark_reported_slow() {
+                self.log.note(&name(supervised.instance), text);
+                supervised.kill_slow_start();
+            } else if starting >= SLOW_START && supervised.mark_reported_slow() {
                 let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
-                said.push(format!("waiting for {} to start{limit}", name(child.instance)));
+                said.push(format!("waiting for {} to start{limit}", name(supervised.instance)));
             }
         }
         said
     }
 
     fn note_incident(&mut self, i: usize, what: IncidentKind, detail: String) {
-        self.incidents
-            .push(Incident::of(self.children[i].instance, what, detail));
+        self.incidents.push(Incident::of(self.roles[i].instance, what, detail));
     }
 
     /// Why the run ends, in one line: the role, what happened, its last message, and what to do. The log has its earlier

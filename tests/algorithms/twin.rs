@@ -177,9 +177,9 @@ pub(crate) fn reinforce(config: &Config) -> String {
         replay.append_and_commit(0, id, &episode).unwrap();
         algorithm.update(&replay, replay.head());
     }
-    let weights = registry::weights(config);
+    let weight_names = registry::weight_names(config);
     let state = algorithm.state();
-    let learned = state.iter().filter(|(name, _)| weights.contains(name));
+    let learned = state.iter().filter(|(name, _)| weight_names.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
 }
 
@@ -225,9 +225,9 @@ pub(crate) fn of_minibatches<A: MinibatchAlgorithm>(config: &Config, mut algorit
             (episode, begun) = (Vec::new(), 0);
         }
     }
-    let weights = registry::weights(config);
+    let weight_names = registry::weight_names(config);
     let state = algorithm.state();
-    let learned = state.iter().filter(|(name, _)| weights.contains(name));
+    let learned = state.iter().filter(|(name, _)| weight_names.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
 }
 

@@ -391,7 +391,7 @@ pub(crate) fn weights(place: &Workplace<'_>, run: &str) -> Result<String, String
     let loaded = loaded.map_err(|error| failed(&error))?;
     let checkpoint = loaded.ok_or_else(|| failed(&"there is no checkpoint"))?.checkpoint;
     let section = |name| checkpoint.arrays.iter().find(|(found, _)| found == name);
-    let weights = registry::weights(&config).into_iter().filter_map(section);
+    let weights = registry::weight_names(&config).into_iter().filter_map(section);
     let weights: Vec<_> = weights.map(|(_, numbers)| numbers.as_slice()).collect();
     Ok(digest::sha256(&weights))
 }

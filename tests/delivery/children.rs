@@ -14,7 +14,7 @@ use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifi
 use shoal_common::commit::CommitReader;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::stop::Stop;
-use shoal_env_server::server::serve;
+use shoal_env_server::server;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::{Replay, ReplayError, WriteStep};
@@ -133,7 +133,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             "send" => u64::from(WINDOW) - 1,
             "finish" => 0,
             "hold" => {
-                let mut chunk = sender.begin().unwrap();
+                let mut chunk = sender.empty_chunk().unwrap();
                 fill(
                     &mut chunk,
                     (index, incarnation, sender.sent() + 1 - before),
@@ -157,7 +157,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             )
             .unwrap();
             if word == "send" {
-                let mut chunk = sender.begin().unwrap();
+                let mut chunk = sender.empty_chunk().unwrap();
                 fill(&mut chunk, (index, incarnation, sender.sent() + 1 - before), ROWS);
                 let begun = Instant::now();
                 sender.send(chunk, 0).unwrap();
@@ -277,7 +277,7 @@ fn env_server(domain: &Domain) {
     let heartbeat = HeartbeatSender::new(domain, instance).unwrap();
     let stop = Stop::when_stdin_closes().unwrap();
     reply("ready");
-    serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
+    server::run(&mut environments, &port, 1, heartbeat, &stop).unwrap();
 }
 
 /// A server that prints `asked` at the first request for a step or snapshot, and never answers it.

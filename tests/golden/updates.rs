@@ -45,7 +45,7 @@ fn ddpg(file: &Value, batches: &Batches) -> Result<(), Failure> {
         ..DdpgConfig::default()
     };
     let mut ddpg = Ddpg::new(&batches.spec, &settings, 0).map_err(|e| e.to_string())?;
-    let learned = settings.learned(&batches.spec);
+    let learned = settings.learned_shapes(&batches.spec);
     let networks = recorded(&[
         ("actor", "actor"),
         ("critic", "critic"),
@@ -75,7 +75,7 @@ fn td3(file: &Value, batches: &Batches) -> Result<(), Failure> {
         ..Td3Config::default()
     };
     let mut td3 = Td3::new(&batches.spec, &settings, 0).map_err(|e| e.to_string())?;
-    let learned = settings.learned(&batches.spec);
+    let learned = settings.learned_shapes(&batches.spec);
     let actors = [("actor", "actor"), ("target_actor", "target actor")];
     let networks = recorded(&[&actors[..], &TWIN_CRITICS].concat());
     repeat(file, batches, &mut td3, &learned, &networks, |td3, recorded, batch| {
@@ -106,7 +106,7 @@ fn sac(file: &Value, batches: &Batches) -> Result<(), Failure> {
         return Err(format!("log σ is clamped to {range:?}"));
     }
     let mut sac = Sac::new(&batches.spec, &settings, 0).map_err(|e| e.to_string())?;
-    let learned = settings.learned(&batches.spec);
+    let learned = settings.learned_shapes(&batches.spec);
     let networks = recorded(&[&[("actor", "actor")][..], &TWIN_CRITICS].concat());
     repeat(file, batches, &mut sac, &learned, &networks, |sac, recorded, batch| {
         let (noise, next_noise) = (columns(recorded, "noise")?, columns(recorded, "next_noise")?);
@@ -130,7 +130,7 @@ fn dqn(file: &Value, batches: &Batches) -> Result<(), Failure> {
         ..DqnConfig::default()
     };
     let mut dqn = Dqn::new(&batches.spec, &settings, 0).map_err(|e| e.to_string())?;
-    let learned = settings.learned(&batches.spec);
+    let learned = settings.learned_shapes(&batches.spec);
     let networks = recorded(&[("q", "action-values"), ("target_q", "target action-values")]);
     repeat(file, batches, &mut dqn, &learned, &networks, |dqn, _, batch| {
         Ok(vec![("loss", dqn.update(batch).critic_loss)])

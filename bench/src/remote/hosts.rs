@@ -326,7 +326,7 @@ impl<'a> RemoteRun<'a> {
                 let sender = &mut paced.sender;
                 let numbers = &self.chunks[self.next_chunk];
                 self.next_chunk = (self.next_chunk + 1) % CHUNKS;
-                let mut chunk = sender.begin()?;
+                let mut chunk = sender.empty_chunk()?;
                 for numbers in numbers.chunks_exact(row.width()) {
                     chunk.push(&row.read(numbers));
                 }

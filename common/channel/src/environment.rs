@@ -9,7 +9,7 @@ mod port;
 mod service;
 
 pub use check::ResponseFault;
-pub use client::{EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult, describe};
+pub use client::{EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult, spec};
 pub use message::{RequestHeader, RequestKind, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 pub(super) use service::create;

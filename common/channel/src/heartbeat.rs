@@ -34,8 +34,8 @@ impl HeartbeatSender {
     }
 
     /// Reports at once that the first step begins. If the process dies in that step, the launcher knows that it was
-    /// working and not waiting.
-    pub fn begin_work(&mut self) {
+    /// working and not waiting. Once a step is counted, this does nothing.
+    pub fn announce_first_step(&mut self) {
         if self.heartbeat.steps == 0 {
             self.beat_now(Activity::Working);
         }

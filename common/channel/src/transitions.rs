@@ -165,7 +165,7 @@ impl ChunkSender {
             incarnation,
             sent: 0,
         };
-        sender.deliver(sender.begin()?, 0)?;
+        sender.deliver(sender.empty_chunk()?, 0)?;
         Ok(Handshake(sender))
     }
 
@@ -183,7 +183,7 @@ impl ChunkSender {
     ///
     /// # Errors
     /// When shared memory is exhausted.
-    pub fn begin(&self) -> Result<Chunk, ChannelError> {
+    pub fn empty_chunk(&self) -> Result<Chunk, ChannelError> {
         let sample = self
             .publisher
             .loan_slice(self.layout.len())

@@ -45,7 +45,7 @@ pub trait AlgorithmSettings {
 
     /// The networks or tables that it learns in an environment like `spec`. `policy` has as many parameters as the
     /// policy of `behaviour`. Names and shapes enter the run's identity, so they never change.
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes;
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes;
 
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;

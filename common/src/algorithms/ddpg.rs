@@ -65,7 +65,7 @@ impl AlgorithmSettings for DdpgConfig {
         Ok(Behaviour::Noise(policy, self.exploration.clone()))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let ActorCritic { actor, critic } = self.networks(spec);
         LearnedShapes {
             policy: ("actor", Shape::Network(actor)),

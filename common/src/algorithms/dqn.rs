@@ -78,7 +78,7 @@ impl AlgorithmSettings for DqnConfig {
         Ok(Behaviour::EpsilonGreedy(values, epsilon))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         LearnedShapes {
             policy: ("action-values", Shape::Network(self.network(spec))),
             others: Vec::new(),

@@ -89,7 +89,7 @@ impl AlgorithmSettings for ReinforceConfig {
         Ok(Behaviour::Softmax(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let ReinforceNetworks { policy, baseline } = self.networks(spec);
         let baseline = baseline.map(|network| ("baseline", Shape::Network(network)));
         LearnedShapes {

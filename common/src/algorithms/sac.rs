@@ -70,7 +70,7 @@ impl AlgorithmSettings for SacConfig {
         Ok(Behaviour::Gaussian(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         self.networks(spec).with_twin_critics()
     }
 

@@ -44,7 +44,7 @@ impl AlgorithmSettings for TabularConfig {
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let (states, actions) = (spec.observation.size(), spec.action.size());
         LearnedShapes {
             policy: ("action-values", Shape::Table { states, actions }),

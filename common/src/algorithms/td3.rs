@@ -81,7 +81,7 @@ impl AlgorithmSettings for Td3Config {
         Ok(Behaviour::Noise(policy, noise))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+    fn learned_shapes(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         self.networks(spec).with_twin_critics()
     }
 

@@ -60,7 +60,7 @@ fn text(config: &Config) -> String {
     line("action", &space(&spec.action));
     line("time limit", &spec.time_limit.to_string());
     line("algorithm", algorithm.name());
-    for (name, shape) in config.learned().iter() {
+    for (name, shape) in config.learned_shapes().iter() {
         line(&format!("learned {name}"), &shape.to_string());
     }
     line("gamma", &algorithm.gamma().to_string());

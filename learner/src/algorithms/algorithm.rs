@@ -21,7 +21,7 @@ pub trait AlgorithmDefinition {
 
     /// Names of the arrays that hold what was learned, as opposed to the state of the optimiser. The statistics of
     /// normalised observations are not among them.
-    fn weights(&self) -> &'static [&'static str];
+    fn weight_names(&self) -> &'static [&'static str];
 
     /// The matrix products of one or a few updates in an environment like `spec`; none if the algorithm has no
     /// networks, or if its updates have no fixed size.

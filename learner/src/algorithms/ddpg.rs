@@ -13,7 +13,7 @@ use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, SampledAlgorithm, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::small_output;
 use crate::networks::pass::{Pass, Samples};
@@ -244,10 +244,10 @@ impl MinibatchAlgorithm for Ddpg {
 impl AlgorithmDefinition for &config::DdpgConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchLearner::new(ddpg, config)?))
+        Ok(Box::new(SampledAlgorithm::new(ddpg, config)?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &ARRAYS[..4]
     }
 
@@ -271,7 +271,7 @@ impl AlgorithmDefinition for &config::DdpgConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * self.learned(spec).parameters()
+        4 * self.learned_shapes(spec).parameters()
     }
 }
 

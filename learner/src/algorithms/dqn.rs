@@ -10,7 +10,7 @@ use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, SampledAlgorithm, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
@@ -197,10 +197,10 @@ impl MinibatchAlgorithm for Dqn {
 impl AlgorithmDefinition for &config::DqnConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchLearner::new(dqn, config)?))
+        Ok(Box::new(SampledAlgorithm::new(dqn, config)?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &ARRAYS[..2]
     }
 

@@ -39,7 +39,7 @@ pub trait MinibatchAlgorithm {
 
 /// An algorithm with its sampling from the replay.
 #[derive(Debug)]
-pub struct MinibatchLearner<A> {
+pub struct SampledAlgorithm<A> {
     algorithm: A,
     sampler: Sampler,
     batch: Minibatch,
@@ -50,7 +50,7 @@ pub struct MinibatchLearner<A> {
     reward_scale: f32,
 }
 
-impl<A: MinibatchAlgorithm> MinibatchLearner<A> {
+impl<A: MinibatchAlgorithm> SampledAlgorithm<A> {
     /// Samples minibatches for the `algorithm` of a run with this configuration.
     ///
     /// # Errors
@@ -71,7 +71,7 @@ impl<A: MinibatchAlgorithm> MinibatchLearner<A> {
     }
 }
 
-impl<A: MinibatchAlgorithm> Algorithm for MinibatchLearner<A> {
+impl<A: MinibatchAlgorithm> Algorithm for SampledAlgorithm<A> {
     fn policy(&self) -> Cow<'_, [f32]> {
         match &self.normaliser {
             None => self.algorithm.policy().into(),

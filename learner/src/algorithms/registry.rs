@@ -33,13 +33,13 @@ pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
 }
 
 /// Names of the arrays of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
-pub fn weights(config: &Config) -> Vec<&'static str> {
+pub fn weight_names(config: &Config) -> Vec<&'static str> {
     let statistics = config.observation.normalise.then_some(Normaliser::ARRAY);
-    let learned = definition(&config.algorithm).weights().iter().copied();
+    let learned = definition(&config.algorithm).weight_names().iter().copied();
     learned.chain(statistics).collect()
 }
 
-/// The first state of a run that begins with the weights of another run. The arrays named in `weights` come from the
+/// The first state of a run that begins with the weights of another run. The arrays in `weight_names` come from the
 /// other run's state `saved`; all others, such as the optimisers' moments, come from the new algorithm `fresh`.
 /// `copied` are the rows of the other replay that the new one begins with. The statistics of observations keep what the
 /// other run had counted, so these rows are not counted again.
@@ -48,12 +48,12 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
 /// When the other state lacks a part, or has it in another shape.
 pub fn inherited(
     fresh: &dyn Algorithm,
-    weights: &[&str],
+    weight_names: &[&str],
     mut saved: SavedState,
     copied: Range<u64>,
 ) -> Result<Vec<(&'static str, Vec<f32>)>, StateArrayError> {
     let array = |(name, numbers): (&'static str, &[f32])| {
-        if !weights.contains(&name) {
+        if !weight_names.contains(&name) {
             return Ok((name, numbers.to_vec()));
         }
         let mut inherited = saved.take(name, numbers.len())?;
@@ -144,9 +144,9 @@ mod tests {
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
             assert_eq!(state_numbers(&config), numbers, "{sections}");
             let named = |name: &&str| state.iter().any(|(array, _)| array == name);
-            let weights = weights(&config);
+            let weight_names = weight_names(&config);
             assert_eq!(
-                weights.contains(&"observations"),
+                weight_names.contains(&"observations"),
                 sections.contains("normalise = true"),
                 "{sections}"
             );
@@ -159,10 +159,10 @@ mod tests {
             for (_, numbers) in other.iter_mut().filter(|(name, _)| name == Normaliser::ARRAY) {
                 numbers[..2].copy_from_slice(&bytemuck::cast::<f64, [f32; 2]>(6.0));
             }
-            let begun = inherited(&*algorithm, &weights, SavedState::from(other), 4..9).unwrap();
+            let begun = inherited(&*algorithm, &weight_names, SavedState::from(other), 4..9).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
-                    name if weights.contains(&name) && name != Normaliser::ARRAY => {
+                    name if weight_names.contains(&name) && name != Normaliser::ARRAY => {
                         assert!(numbers.iter().all(|it| *it == 0.5), "{name}")
                     }
                     Normaliser::ARRAY => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(2.0)),
@@ -171,7 +171,7 @@ mod tests {
             }
             // Only some algorithms have a baseline.
             assert!(
-                weights.iter().filter(|name| **name != "baseline").all(named),
+                weight_names.iter().filter(|name| **name != "baseline").all(named),
                 "{sections}"
             );
         }

@@ -227,13 +227,13 @@ impl AlgorithmDefinition for &config::ReinforceConfig {
         Ok(Box::new(Reinforce::new(self, spec, seed, RunSizes::from(config))?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &Reinforce::WEIGHTS
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its two moments, and the steps of Adam.
-        3 * self.learned(spec).parameters() + 1
+        3 * self.learned_shapes(spec).parameters() + 1
     }
 }
 

@@ -19,7 +19,7 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, SampledAlgorithm, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
@@ -384,10 +384,10 @@ fn array_names() -> impl Iterator<Item = &'static str> {
 impl AlgorithmDefinition for &config::SacConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchLearner::new(sac, config)?))
+        Ok(Box::new(SampledAlgorithm::new(sac, config)?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &WEIGHTS
     }
 

@@ -41,13 +41,13 @@ impl AlgorithmDefinition for TabularDefinition<'_> {
         )?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &Tabular::WEIGHTS
     }
 
     /// The table, a pending step for each environment, and the two halves of a row's number.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
-        self.settings.learned(spec).parameters() + environment_count(sizes) * PENDING + 2
+        self.settings.learned_shapes(spec).parameters() + environment_count(sizes) * PENDING + 2
     }
 }
 

@@ -15,7 +15,7 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, SampledAlgorithm, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
@@ -218,10 +218,10 @@ impl MinibatchAlgorithm for Td3 {
 impl AlgorithmDefinition for &config::Td3Config {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchLearner::new(td3, config)?))
+        Ok(Box::new(SampledAlgorithm::new(td3, config)?))
     }
 
-    fn weights(&self) -> &'static [&'static str] {
+    fn weight_names(&self) -> &'static [&'static str] {
         &WEIGHTS
     }
 
@@ -241,7 +241,7 @@ impl AlgorithmDefinition for &config::Td3Config {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * self.learned(spec).parameters()
+        4 * self.learned_shapes(spec).parameters()
     }
 }
 

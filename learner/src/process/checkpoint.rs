@@ -48,11 +48,11 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// SHA-256 of the learned weights, in the order of [`registry::weights`]; for DDPG: actor, critic and both targets.
-    /// If observations are normalised, their statistics are included.
+    /// SHA-256 of the learned weights, in the order of [`registry::weight_names`]; for DDPG: actor, critic and both
+    /// targets. If observations are normalised, their statistics are included.
     pub fn weights_sha256(&self, config: &shoal_common::config::Config) -> String {
         let array = |name| self.arrays.iter().find(|(found, _)| found == name);
-        let weights = registry::weights(config).into_iter().filter_map(array);
+        let weights = registry::weight_names(config).into_iter().filter_map(array);
         digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
     }
 }

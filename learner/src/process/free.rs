@@ -22,8 +22,8 @@ const LAST_EVALUATION_TIMEOUT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let config = &learner.settings.config;
-    let every = Duration::from_secs_f64(config.checkpoint.every_seconds);
-    let mut saved = Instant::now();
+    let save_interval = Duration::from_secs_f64(config.checkpoint.every_seconds);
+    let mut saved_at = Instant::now();
     // After a crash the replay is ahead of the checkpoint. Those rows count.
     learner.advance_to(learner.replay.head());
     loop {
@@ -64,9 +64,9 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             }
             learner.refresh_connections(activity)?;
         }
-        if saved.elapsed() >= every {
+        if saved_at.elapsed() >= save_interval {
             learner.save()?;
-            saved = Instant::now();
+            saved_at = Instant::now();
         }
     }
 }

@@ -211,7 +211,7 @@ fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usi
         });
     }
     let id = chunk.id(replay.committed(actor).last_chunk);
-    let Some(reserved) = replay.begin(actor, id).map_err(refused)? else {
+    let Some(reserved) = replay.reserve(actor, id).map_err(refused)? else {
         return Ok(Appended::Duplicate);
     };
     let filled = reserved.fill(rows).map_err(refused)?;

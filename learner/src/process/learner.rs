@@ -151,7 +151,7 @@ impl<'a> Learner<'a> {
     /// Makes the next update, on the replay as it was after `self.env_steps` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
-        self.heartbeat.begin_work();
+        self.heartbeat.announce_first_step();
         if let Some(losses) = self.algorithm.update(&self.replay, self.env_steps) {
             if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
                 return Err(LearnerError::Diverged {

@@ -59,7 +59,7 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     } else {
         0
     };
-    let (_, policy) = config.learned().policy;
+    let (_, policy) = config.learned_shapes().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,
     // the last, and one while it is written.
     let numbers = 3 * (registry::state_numbers(config) + policy.parameters()) as u64;

@@ -35,12 +35,12 @@ pub struct FilledChunk<'a> {
 }
 
 impl Replay {
-    /// Starts a chunk. Returns `None` if it or a later one of its actor was committed before.
+    /// Reserves the place of a chunk. Returns `None` if it or a later one of its actor was committed before.
     ///
     /// # Errors
     /// When the actor is unknown, or the chunk is not the next one. The next one has the same incarnation and the next
     /// sequence number, or it is the first of a later incarnation, which has no rows and keeps the sequence number.
-    pub fn begin(&mut self, actor: usize, id: ChunkId) -> Result<Option<ReservedChunk<'_>>, ChunkError> {
+    pub fn reserve(&mut self, actor: usize, id: ChunkId) -> Result<Option<ReservedChunk<'_>>, ChunkError> {
         let actors = self.layout.actors;
         if actor >= actors {
             return Err(ChunkError::Actor { actor, actors });
@@ -59,9 +59,9 @@ impl Replay {
         }))
     }
 
-    /// Starts, fills and commits a chunk in one call.
+    /// Reserves, fills and commits a chunk in one call.
     pub fn append_and_commit(&mut self, actor: usize, id: ChunkId, rows: &[f32]) -> Result<Appended, ChunkError> {
-        match self.begin(actor, id)? {
+        match self.reserve(actor, id)? {
             Some(chunk) => {
                 chunk.fill(rows)?.commit();
                 Ok(Appended::Accepted)

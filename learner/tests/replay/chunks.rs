@@ -88,7 +88,7 @@ fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_the_rows_it_overwrot
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
     drop(
         replay
-            .begin(1, id(0, 1))
+            .reserve(1, id(0, 1))
             .unwrap()
             .unwrap()
             .fill(&chunk(1, id(0, 1), 3))

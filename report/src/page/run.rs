@@ -8,7 +8,7 @@ use shoal_run::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult
 use shoal_run::origin::Origin;
 use shoal_run::records::outcome::{RunOutcome, RunState};
 use shoal_run::records::recorder::{
-    ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
+    ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRecord, LearnerRecord, read_changes, read_episodes,
     read_evaluations, read_hosts, read_incidents, read_learner,
 };
 use shoal_run::records::start::StartRecord;
@@ -119,7 +119,7 @@ struct LearnerCurves {
 
 #[derive(Clone, Debug, Serialize)]
 struct Incidents {
-    rows: Vec<IncidentRow>,
+    rows: Vec<IncidentRecord>,
     /// Number of later incidents that are not listed.
     more: usize,
     restarts: usize,
@@ -311,7 +311,7 @@ fn last_is_incomplete(rows: &[LearnerRecord]) -> bool {
 }
 
 impl Incidents {
-    fn of(mut rows: Vec<IncidentRow>) -> Self {
+    fn of(mut rows: Vec<IncidentRecord>) -> Self {
         use shoal_run::records::recorder::IncidentKind;
         let count = |what| rows.iter().filter(|row| row.what == what).count();
         let (restarts, kills) = (count(IncidentKind::Restarted), count(IncidentKind::Killed));

@@ -123,7 +123,7 @@ impl RunOverrides {
     }
 
     /// Directory and configuration of the run whose networks the new one begins with.
-    pub(super) fn predecessor(&self) -> anyhow::Result<Option<(PathBuf, Config)>> {
+    pub(super) fn source_run(&self) -> anyhow::Result<Option<(PathBuf, Config)>> {
         let Some(from) = &self.from else { return Ok(None) };
         let run = RunDir::open(from)?;
         Ok(Some((run.path().to_owned(), run.config()?)))

@@ -99,7 +99,7 @@ pub(super) fn resolve_all(what: &str, overrides: &RunOverrides, interrupt: Inter
     // That has added an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;
-    set_from_predecessor(&mut table, &mut sources, overrides)?;
+    set_from_source_run(&mut table, &mut sources, overrides)?;
     if let Some(dataset) = overrides.absolute_dataset()? {
         put(&mut table, &["run", "demonstrations"], dataset.into())?;
     }
@@ -178,12 +178,12 @@ fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow
 }
 
 /// Sets the shapes of the networks of the `--from` run, and what else follows from it, except keys that the user has set.
-fn set_from_predecessor(
+fn set_from_source_run(
     table: &mut Table,
     sources: &mut SettingSources,
     overrides: &RunOverrides,
 ) -> anyhow::Result<()> {
-    let Some((path, config)) = overrides.predecessor()? else {
+    let Some((path, config)) = overrides.source_run()? else {
         return Ok(());
     };
     put(table, &["run", "from"], path.display().to_string().into())?;

@@ -24,7 +24,7 @@ pub(super) fn sections_for_algorithm(
 ) -> anyhow::Result<(String, Table, SettingSources)> {
     let (mut name, mut table, mut sources) = sections(what)?;
     let asked = algorithm::asked_for(overrides.algorithm.as_deref(), &overrides.set)?;
-    let of_networks = overrides.predecessor()?.map(|(_, config)| config.algorithm.name());
+    let of_networks = overrides.source_run()?.map(|(_, config)| config.algorithm.name());
     let Some(algorithm) = asked.or(of_networks) else {
         return Ok((name, table, sources));
     };

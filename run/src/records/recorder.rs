@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 pub use change::{ChangeRecord, Moment, read_changes, record_changes};
 use host::HostTable;
 pub use host::{HostRecord, RecordedHostState, read_hosts};
-pub use incident::{Incident, IncidentKind, IncidentRow};
+pub use incident::{Incident, IncidentKind, IncidentRecord};
 use serde::{Deserialize, Serialize};
 use shoal_common::channel::control::HostStatus;
 use shoal_common::config::{Config, ReplayConfig};
@@ -111,9 +111,9 @@ pub struct Recorder {
     hosts: HostTable,
     events: EventFile,
     events_path: std::path::PathBuf,
-    ratio: ReplayConfig,
+    replay: ReplayConfig,
     /// Running time of earlier launchers in seconds.
-    earlier: f64,
+    earlier_seconds: f64,
     /// Environment steps of the last row of `learner.csv`.
     env_steps: u64,
     /// Environment steps of the last row of `episodes.csv`.
@@ -153,19 +153,19 @@ pub fn record_final(run: &RunDir, env_steps: u64) -> anyhow::Result<()> {
 }
 
 impl Recorder {
-    /// Opens the records of `run`, whose ratio of updates to environment steps is that of `ratio`.
-    pub fn open(run: &RunDir, ratio: &ReplayConfig) -> Result<Self, RecordError> {
+    /// Opens the records of `run`, whose ratio of updates to environment steps is that of `replay`.
+    pub fn open(run: &RunDir, replay: &ReplayConfig) -> Result<Self, RecordError> {
         let episodes = Table::open::<EpisodeRecord>(&run.episodes())?;
         let evaluations = Table::open::<EvaluationRecord>(&run.evaluations())?;
         let learner = Table::open::<LearnerRecord>(&run.learner_records())?;
-        let incidents = Table::open::<IncidentRow>(&run.incidents())?;
+        let incidents = Table::open::<IncidentRecord>(&run.incidents())?;
         change::create(run)?;
         let evaluated = read_evaluations(&run.evaluations())?
             .iter()
             .map(|row| row.env_steps)
             .max();
         let learned = read_learner(&run.learner_records())?;
-        let earlier = learned.last().map_or(0.0, |row| row.wall_seconds);
+        let earlier_seconds = learned.last().map_or(0.0, |row| row.wall_seconds);
         // Not the last rows: in records of earlier versions the steps may have fallen.
         let env_steps = learned.iter().map(|row| row.env_steps).max().unwrap_or(0);
         let mut episode_steps = 0;
@@ -187,8 +187,8 @@ impl Recorder {
             hosts: HostTable::new(run.hosts()),
             events,
             events_path,
-            ratio: ratio.clone(),
-            earlier,
+            replay: replay.clone(),
+            earlier_seconds,
             env_steps,
             episode_steps,
             evaluated,
@@ -291,7 +291,7 @@ impl Recorder {
             q_mean: averaged(report.q_mean),
             updates_per_second: rate(|report| report.updates),
             env_steps_per_second: rate(|report| report.env_steps),
-            ratio: self.ratio.ratio(report.updates, report.env_steps),
+            ratio: self.replay.ratio(report.updates, report.env_steps),
             temperature: averaged(report.temperature).filter(|temperature| temperature.is_finite()),
         };
         self.env_steps = report.env_steps;
@@ -315,7 +315,7 @@ impl Recorder {
 
     /// Records an incident. It is in the file when this returns.
     pub fn incident(&mut self, incident: &Incident, wall: Duration) -> Result<(), RecordError> {
-        self.incidents.write(&IncidentRow {
+        self.incidents.write(&IncidentRecord {
             wall_seconds: self.seconds(wall),
             env_steps: self.env_steps,
             role: incident.role.into(),
@@ -365,7 +365,7 @@ impl Recorder {
 
     /// Running time of the run so far in seconds, rounded to milliseconds.
     fn seconds(&self, wall: Duration) -> f64 {
-        ((self.earlier + wall.as_secs_f64()) * 1e3).round() / 1e3
+        ((self.earlier_seconds + wall.as_secs_f64()) * 1e3).round() / 1e3
     }
 }
 
@@ -385,7 +385,7 @@ pub fn read_learner(path: &Path) -> Result<Vec<LearnerRecord>, RecordError> {
 }
 
 /// The rows of an `incidents.csv`; `None` if there is no such file, as in runs of earlier versions.
-pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordError> {
+pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRecord>>, RecordError> {
     let is_missing = matches!(path.try_exists(), Ok(false));
     (!is_missing).then(|| table::rows(path)).transpose()
 }

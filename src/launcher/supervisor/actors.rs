@@ -11,10 +11,10 @@ use shoal_remote::wire::cores;
 use shoal_run::records::recorder::{Incident, IncidentKind};
 
 use super::Supervisor;
-use crate::launcher::child::Child;
 use crate::launcher::local_actors;
 use crate::launcher::process::name;
 use crate::launcher::shares::ActorHost;
+use crate::launcher::supervised_role::SupervisedRole;
 
 /// The pause before the next attempt to create what further actors need.
 const REFUSED_ACTORS_PAUSE: Duration = Duration::from_secs(1);
@@ -65,9 +65,9 @@ impl ActorSet {
         (self.wanted.len() + self.to_take) as u32
     }
 
-    /// Whether the child should run: not a surplus actor, and not the environment server of one.
-    pub(super) fn is_wanted(&self, child: &Child) -> bool {
-        let RoleInstance { role, index, .. } = child.instance;
+    /// Whether the role should run: not a surplus actor, and not the environment server of one.
+    pub(super) fn is_wanted(&self, supervised: &SupervisedRole) -> bool {
+        let RoleInstance { role, index, .. } = supervised.instance;
         // The index of the evaluator's server is the maximum number of actors.
         !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max || self.wanted.contains(&index)
     }
@@ -145,7 +145,7 @@ impl Supervisor {
 
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
     pub(crate) fn replace_actor(&mut self, index: u32, incarnation: u64) {
-        let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
+        let actor = self.roles.iter_mut().find(|it| it.is(Role::Actor, index));
         if let Some(actor) = actor.filter(|actor| actor.instance.incarnation <= incarnation)
             && let Some(process) = &mut actor.process
         {
@@ -213,8 +213,8 @@ impl Supervisor {
         }
         self.actors.refused = None;
         for (role, index) in missing {
-            self.children.push(Child::new(role, index));
-            self.start(self.children.len() - 1)?;
+            self.roles.push(SupervisedRole::new(role, index));
+            self.start(self.roles.len() - 1)?;
         }
         Ok(())
     }
@@ -225,34 +225,35 @@ impl Supervisor {
         let mut missing: Vec<_> = wanted
             .flat_map(|index| [(Role::EnvServer, *index), (Role::Actor, *index)])
             .collect();
-        missing.retain(|(role, index)| !self.children.iter().any(|child| child.is(*role, *index)));
+        missing.retain(|(role, index)| !self.roles.iter().any(|it| it.is(*role, *index)));
         missing
     }
 
     /// Retires surplus actors and then their environment servers.
     pub(super) fn retire_surplus(&mut self) {
-        let has_no_client = |children: &[Child], child: &Child| {
-            child.instance.role == Role::EnvServer
-                && !children.iter().any(|actor| actor.is(Role::Actor, child.instance.index))
+        let has_no_client = |roles: &[SupervisedRole], supervised: &SupervisedRole| {
+            supervised.instance.role == Role::EnvServer
+                && !roles
+                    .iter()
+                    .any(|actor| actor.is(Role::Actor, supervised.instance.index))
         };
-        let mut children = std::mem::take(&mut self.children);
-        children.retain(|child| {
-            let stays = child.process.is_some() || self.actors.is_wanted(child);
+        let mut roles = std::mem::take(&mut self.roles);
+        roles.retain(|supervised| {
+            let stays = supervised.process.is_some() || self.actors.is_wanted(supervised);
             if !stays {
-                self.log.note(&name(child.instance), "no longer needed");
+                self.log.note(&name(supervised.instance), "no longer needed");
             }
             stays
         });
-        self.children = children;
-        for i in 0..self.children.len() {
-            if self.actors.is_wanted(&self.children[i]) || self.children[i].is_retiring {
+        self.roles = roles;
+        for i in 0..self.roles.len() {
+            if self.actors.is_wanted(&self.roles[i]) || self.roles[i].is_retiring {
                 continue;
             }
-            let may_end =
-                self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
-            let child = &mut self.children[i];
-            if let Some(process) = child.process.as_mut().filter(|_| may_end) {
-                child.is_retiring = true;
+            let may_end = self.roles[i].instance.role == Role::Actor || has_no_client(&self.roles, &self.roles[i]);
+            let supervised = &mut self.roles[i];
+            if let Some(process) = supervised.process.as_mut().filter(|_| may_end) {
+                supervised.is_retiring = true;
                 process.ask_to_retire();
             }
         }

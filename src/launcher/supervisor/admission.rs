@@ -34,7 +34,7 @@ impl Supervisor {
             Some(_) => self.actors.wanted.iter().rev().copied().collect(),
             // The services of a retiring actor are in use.
             None => {
-                let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
+                let exists = |index: u32| self.roles.iter().any(|it| it.is(Role::Actor, index));
                 let mut free: Vec<u32> = self.free_actors().filter(|index| !exists(*index)).collect();
                 // Actors that this host cannot have come first.
                 free.sort_by_key(|index| (*index < self.actors.max_here, *index));

@@ -11,9 +11,9 @@ use crate::launcher::process::{describe_exit, name};
 impl Supervisor {
     /// Asks the processes of a role to hand over what they have and then to end.
     pub(crate) fn ask_to_retire(&mut self, role: Role) {
-        for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
-            if let Some(process) = &mut child.process {
-                child.is_asked_to_end = true;
+        for supervised in self.roles.iter_mut().filter(|it| it.instance.role == role) {
+            if let Some(process) = &mut supervised.process {
+                supervised.is_asked_to_end = true;
                 process.ask_to_retire();
             }
         }
@@ -21,13 +21,13 @@ impl Supervisor {
 
     /// Asks the processes of some roles to end.
     pub(crate) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            match &mut child.process {
+        for supervised in self.roles.iter_mut().filter(|it| which(it.instance.role)) {
+            match &mut supervised.process {
                 Some(process) => {
-                    child.is_asked_to_end = true;
+                    supervised.is_asked_to_end = true;
                     process.ask_to_end();
                 }
-                None if child.instance.role == Role::Learner && !self.learner_done => {
+                None if supervised.instance.role == Role::Learner && !self.learner_done => {
                     self.unsaved_learner = Some("it had died and was not restarted yet".into());
                 }
                 None => {}
@@ -38,12 +38,14 @@ impl Supervisor {
     /// Collects the exit statuses of some roles' processes. Returns whether all of them have ended.
     pub(crate) fn reap(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            let Some(process) = &mut child.process else { continue };
+        for supervised in self.roles.iter_mut().filter(|it| which(it.instance.role)) {
+            let Some(process) = &mut supervised.process else {
+                continue;
+            };
             match process.exit_status() {
                 Some(status) => {
-                    (child.process, child.ended) = (None, Some(status));
-                    if child.instance.role == Role::Learner {
+                    (supervised.process, supervised.ended) = (None, Some(status));
+                    if supervised.instance.role == Role::Learner {
                         self.learner_done = status.success();
                         self.unsaved_learner = (!status.success()).then(|| describe_exit(status));
                     }
@@ -56,20 +58,20 @@ impl Supervisor {
 
     /// Whether the only process of a role has ended by itself, and not in order.
     pub(crate) fn has_failed(&self, role: Role) -> bool {
-        let mut children = self.children.iter();
-        let ended = children.find(|child| child.is(role, 0)).and_then(|child| child.ended);
+        let mut roles = self.roles.iter();
+        let ended = roles.find(|it| it.is(role, 0)).and_then(|it| it.ended);
         ended.is_some_and(|status| !status.success())
     }
 
     /// Kills the processes of some roles. `why` says what they did, as in "did not end when asked to".
     pub(crate) fn kill(&mut self, which: impl Fn(Role) -> bool, why: &str) {
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            if child.process.take().is_some() {
-                let name = name(child.instance);
+        for supervised in self.roles.iter_mut().filter(|it| which(it.instance.role)) {
+            if supervised.process.take().is_some() {
+                let name = name(supervised.instance);
                 self.log.note(&name, &format!("{why}, and was killed"));
                 self.incidents
-                    .push(Incident::of(child.instance, IncidentKind::Killed, why.into()));
-                if child.instance.role == Role::Learner {
+                    .push(Incident::of(supervised.instance, IncidentKind::Killed, why.into()));
+                if supervised.instance.role == Role::Learner {
                     self.unsaved_learner = Some(format!("it {why}, and was killed"));
                 }
             }

@@ -23,7 +23,7 @@ impl Supervisor {
     /// Counts an invalid answer of environment server `index`, which `client` has reported.
     pub(super) fn note_fault(&mut self, client: &str, index: u32) {
         self.faults.count = self.faults.count.saturating_add(1);
-        let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
+        let server = self.roles.iter().find(|it| it.is(Role::EnvServer, index));
         if let Some(server) = server {
             // A server that checks its own answers has logged the fault, otherwise its client has.
             let by_client = self

@@ -128,7 +128,7 @@ impl EnvironmentResponse {
 ///
 /// # Errors
 /// When `stop` is requested, or the channel fails.
-pub fn describe(
+pub fn spec(
     domain: &Domain,
     index: u32,
     listener: &Listener,
@@ -142,12 +142,12 @@ pub fn describe(
         time_limit: 0,
         state_width: 0,
     };
-    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, idle)
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.spec(listener, idle)
 }
 
 impl EnvironmentClient {
     /// Connects to environment server `index`, which is expected to step this many environments like `spec`; use
-    /// [`describe`](Self::describe) to verify it. Waiting for a response ends when `stop` is requested.
+    /// [`spec`](Self::spec()) to verify it. Waiting for a response ends when `stop` is requested.
     ///
     /// # Errors
     /// When shared memory is unavailable.
@@ -189,7 +189,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When a stop is requested, the channel fails, the server refuses, or its response fits no spaces.
-    pub fn describe(
+    pub fn spec(
         &self,
         listener: &Listener,
         mut idle: impl FnMut(),

@@ -139,7 +139,7 @@ impl Request<'_> {
     }
 
     /// The words of the snapshot to restore.
-    pub fn words(&self) -> Vec<u64> {
+    pub fn snapshot_words(&self) -> Vec<u64> {
         words_of(self.request.payload())
     }
 

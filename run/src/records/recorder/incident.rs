@@ -66,7 +66,7 @@ impl Incident {
 
 /// A row of `incidents.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct IncidentRow {
+pub struct IncidentRecord {
     /// Running time of the run so far in seconds, over all its launchers.
     pub wall_seconds: f64,
     /// Environment steps by the learner's last report.

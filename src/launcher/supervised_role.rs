@@ -1,4 +1,4 @@
-//! A child of the supervisor: a role's current process, its progress, and what follows when it ends.
+//! A role under the supervisor: its current process, its progress, and what follows when it ends.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -34,7 +34,7 @@ const RATE_SPAN: Duration = Duration::from_millis(400);
 
 /// A role of the run, its current process, and the history of the earlier ones.
 #[derive(Debug)]
-pub(super) struct Child {
+pub(super) struct SupervisedRole {
     pub(super) instance: RoleInstance,
     pub(super) process: Option<Process>,
     /// The exit status of a process whose end has been observed but not handled.
@@ -92,7 +92,7 @@ pub(super) enum RestartDecision {
     GiveUp(u32),
 }
 
-impl Child {
+impl SupervisedRole {
     /// A role without a process.
     pub(super) fn new(role: Role, index: u32) -> Self {
         let now = Instant::now();
@@ -392,16 +392,16 @@ mod tests {
         ExitStatus::from_raw(code << 8)
     }
 
-    /// A child with a simulated clock.
+    /// A role with a simulated clock.
     struct Simulation {
-        child: Child,
+        role: SupervisedRole,
         now: Instant,
     }
 
     impl Simulation {
         fn new(role: Role) -> Self {
             Self {
-                child: Child::new(role, 0),
+                role: SupervisedRole::new(role, 0),
                 now: Instant::now(),
             }
         }
@@ -414,12 +414,12 @@ mod tests {
             last: Heartbeat,
             end: ExitStatus,
         ) -> RestartDecision {
-            self.child.begin_at(self.now);
+            self.role.begin_at(self.now);
             if let Some(ready) = ready {
-                self.child.record_at(&last, self.now + ready);
+                self.role.record_at(&last, self.now + ready);
             }
             self.now += lived;
-            let decision = self.child.handle_end_at(end, GIVE_UP_AFTER, self.now);
+            let decision = self.role.handle_end_at(end, GIVE_UP_AFTER, self.now);
             if let RestartDecision::Restart(pause) = decision {
                 self.now += pause;
             }
@@ -427,7 +427,7 @@ mod tests {
         }
 
         fn heartbeat(&self, activity: Activity, steps: u64) -> Heartbeat {
-            let mut heartbeat = Heartbeat::new(self.child.instance);
+            let mut heartbeat = Heartbeat::new(self.role.instance);
             heartbeat.set_activity(activity);
             heartbeat.steps = steps;
             heartbeat
@@ -440,13 +440,13 @@ mod tests {
 
     #[test]
     fn a_process_that_continues_after_a_silence_has_not_been_idle() {
-        let mut child = Simulation::new(Role::Evaluator);
-        let begun = child.now;
-        child.child.begin_at(begun);
-        let waiting = child.heartbeat(Activity::WaitingForPeer, 5);
+        let mut simulation = Simulation::new(Role::Evaluator);
+        let begun = simulation.now;
+        simulation.role.begin_at(begun);
+        let waiting = simulation.heartbeat(Activity::WaitingForPeer, 5);
         let mut record = |second| {
-            child.child.record_at(&waiting, begun + Duration::from_secs(second));
-            (child.child.progress_at - begun).as_secs()
+            simulation.role.record_at(&waiting, begun + Duration::from_secs(second));
+            (simulation.role.progress_at - begun).as_secs()
         };
         assert_eq!([record(1), record(2), record(4)], [1, 1, 1], "it waits");
         assert_eq!([record(64), record(65)], [64, 64], "it was stopped for a minute");
@@ -454,40 +454,40 @@ mod tests {
 
     #[test]
     fn a_role_that_always_fails_is_given_up_after_half_a_minute_of_growing_pauses() {
-        let mut child = Simulation::new(Role::Actor);
-        let (begun, mut pauses) = (child.now, Vec::new());
-        let last = child.heartbeat(Activity::Working, 0);
-        while let RestartDecision::Restart(pause) = child.live(READY, None, last, with_code(1)) {
+        let mut simulation = Simulation::new(Role::Actor);
+        let (begun, mut pauses) = (simulation.now, Vec::new());
+        let last = simulation.heartbeat(Activity::Working, 0);
+        while let RestartDecision::Restart(pause) = simulation.live(READY, None, last, with_code(1)) {
             pauses.push(pause.as_millis());
         }
         assert_eq!(pauses[..7], [100, 200, 400, 800, 1600, 3200, 4000]);
-        let tried = child.now - begun;
+        let tried = simulation.now - begun;
         assert!((30..40).contains(&tried.as_secs()), "{tried:?}");
     }
 
     #[test]
     fn a_role_with_long_starts_is_given_up_later() {
-        let mut child = Simulation::new(Role::EnvServer);
-        let begun = child.now;
-        let last = child.heartbeat(Activity::Working, 0);
+        let mut simulation = Simulation::new(Role::EnvServer);
+        let begun = simulation.now;
+        let last = simulation.heartbeat(Activity::Working, 0);
         let mut starts = 1;
-        while child.live(Duration::from_secs(60), None, last, with_code(1)) != RestartDecision::GiveUp(starts) {
+        while simulation.live(Duration::from_secs(60), None, last, with_code(1)) != RestartDecision::GiveUp(starts) {
             starts += 1;
         }
         assert_eq!(starts, MAX_FAILURES);
-        assert!(child.now - begun >= Duration::from_secs(300));
+        assert!(simulation.now - begun >= Duration::from_secs(300));
     }
 
     #[test]
     fn being_killed_while_starting_waiting_or_working_is_not_a_failure() {
-        let mut child = Simulation::new(Role::Evaluator);
+        let mut simulation = Simulation::new(Role::Evaluator);
         for _ in 0..1000 {
             let (idle, at_work) = (
-                child.heartbeat(Activity::WaitingForPeer, 0),
-                child.heartbeat(Activity::Working, 9),
+                simulation.heartbeat(Activity::WaitingForPeer, 0),
+                simulation.heartbeat(Activity::Working, 9),
             );
             for (ready, last) in [(None, idle), (Some(READY), idle), (Some(READY), at_work)] {
-                let decision = child.live(10 * READY, ready, last, by_signal(KILLED));
+                let decision = simulation.live(10 * READY, ready, last, by_signal(KILLED));
                 let pause = if ready.is_some() { Duration::ZERO } else { FIRST_PAUSE };
                 assert_eq!(decision, RestartDecision::Restart(pause));
             }
@@ -496,12 +496,15 @@ mod tests {
 
     #[test]
     fn being_killed_after_the_usual_time_of_a_start_is_a_failure() {
-        let mut child = Simulation::new(Role::EnvServer);
-        let idle = child.heartbeat(Activity::WaitingForPeer, 0);
-        child.live(READY, Some(READY), idle, by_signal(KILLED));
-        let killed = |child: &mut Simulation, lived| child.live(lived, None, idle, by_signal(KILLED));
-        assert_eq!(killed(&mut child, START_TIME), RestartDecision::Restart(FIRST_PAUSE));
-        let counted = (0..100).find_map(|_| match killed(&mut child, 2 * START_TIME) {
+        let mut simulation = Simulation::new(Role::EnvServer);
+        let idle = simulation.heartbeat(Activity::WaitingForPeer, 0);
+        simulation.live(READY, Some(READY), idle, by_signal(KILLED));
+        let killed = |simulation: &mut Simulation, lived| simulation.live(lived, None, idle, by_signal(KILLED));
+        assert_eq!(
+            killed(&mut simulation, START_TIME),
+            RestartDecision::Restart(FIRST_PAUSE)
+        );
+        let counted = (0..100).find_map(|_| match killed(&mut simulation, 2 * START_TIME) {
             RestartDecision::GiveUp(starts) => Some(starts),
             RestartDecision::Restart(_) => None,
         });
@@ -510,14 +513,16 @@ mod tests {
 
     #[test]
     fn a_role_that_never_starts_in_time_is_given_up() {
-        let mut child = Simulation::new(Role::EnvServer);
+        let mut simulation = Simulation::new(Role::EnvServer);
         let given_up = (0..100).any(|_| {
-            child.child.begin_at(child.now);
-            child.child.kill_slow_start();
-            child.now += READY;
-            let decision = child.child.handle_end_at(by_signal(KILLED), GIVE_UP_AFTER, child.now);
+            simulation.role.begin_at(simulation.now);
+            simulation.role.kill_slow_start();
+            simulation.now += READY;
+            let decision = simulation
+                .role
+                .handle_end_at(by_signal(KILLED), GIVE_UP_AFTER, simulation.now);
             if let RestartDecision::Restart(pause) = decision {
-                child.now += pause;
+                simulation.now += pause;
             }
             matches!(decision, RestartDecision::GiveUp(_))
         });
@@ -527,10 +532,10 @@ mod tests {
     #[test]
     fn a_role_that_always_dies_in_its_first_step_is_given_up() {
         for end in [by_signal(KILLED), by_signal(SIGSEGV), with_code(1)] {
-            let mut child = Simulation::new(Role::EnvServer);
-            let in_first_step = child.heartbeat(Activity::Working, 0);
+            let mut simulation = Simulation::new(Role::EnvServer);
+            let in_first_step = simulation.heartbeat(Activity::Working, 0);
             let given_up = (0..100).any(|_| {
-                let decision = child.live(10 * READY, Some(READY), in_first_step, end);
+                let decision = simulation.live(10 * READY, Some(READY), in_first_step, end);
                 matches!(decision, RestartDecision::GiveUp(_))
             });
             assert!(given_up, "{end}");
@@ -539,40 +544,40 @@ mod tests {
 
     #[test]
     fn a_role_that_always_fails_after_a_few_steps_is_given_up() {
-        let mut child = Simulation::new(Role::EnvServer);
-        let at_work = child.heartbeat(Activity::Working, 3);
-        let mut ends = (0..100).map(|_| child.live(10 * READY, Some(READY), at_work, with_code(1)));
+        let mut simulation = Simulation::new(Role::EnvServer);
+        let at_work = simulation.heartbeat(Activity::Working, 3);
+        let mut ends = (0..100).map(|_| simulation.live(10 * READY, Some(READY), at_work, with_code(1)));
         assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))));
     }
 
     #[test]
     fn a_learner_that_always_fails_while_saving_is_given_up() {
-        let mut child = Simulation::new(Role::Learner);
-        let at_work = child.heartbeat(Activity::Working, 3000);
-        let mut ends = (0..100).map(|_| child.live(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
+        let mut simulation = Simulation::new(Role::Learner);
+        let at_work = simulation.heartbeat(Activity::Working, 3000);
+        let mut ends = (0..100).map(|_| simulation.live(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
         assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))));
     }
 
     #[test]
     fn a_learner_that_fails_after_long_work_is_given_up_unless_it_has_saved_something_or_was_killed() {
-        let live = |child: &mut Simulation, version, end| {
-            let mut at_work = child.heartbeat(Activity::Working, 3000);
+        let live = |simulation: &mut Simulation, version, end| {
+            let mut at_work = simulation.heartbeat(Activity::Working, 3000);
             at_work.policy_version = version;
-            child.live(2 * PROVEN_AFTER, Some(READY), at_work, end)
+            simulation.live(2 * PROVEN_AFTER, Some(READY), at_work, end)
         };
         for role in [Role::Learner, Role::Evaluator] {
-            let mut child = Simulation::new(role);
-            let mut ends = (0..10).map(|_| live(&mut child, 7, with_code(1)));
+            let mut simulation = Simulation::new(role);
+            let mut ends = (0..10).map(|_| live(&mut simulation, 7, with_code(1)));
             assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))), "{role:?}");
 
-            let mut child = Simulation::new(role);
+            let mut simulation = Simulation::new(role);
             for version in 0..100 {
                 assert_eq!(
-                    live(&mut child, version, with_code(1)),
+                    live(&mut simulation, version, with_code(1)),
                     RestartDecision::Restart(FIRST_PAUSE)
                 );
                 assert_eq!(
-                    live(&mut child, version, by_signal(KILLED)),
+                    live(&mut simulation, version, by_signal(KILLED)),
                     RestartDecision::Restart(Duration::ZERO)
                 );
             }
@@ -581,10 +586,10 @@ mod tests {
 
     #[test]
     fn an_environment_server_that_fails_after_many_steps_is_always_restarted() {
-        let mut child = Simulation::new(Role::EnvServer);
-        let at_work = child.heartbeat(Activity::Working, 3000);
+        let mut simulation = Simulation::new(Role::EnvServer);
+        let at_work = simulation.heartbeat(Activity::Working, 3000);
         for _ in 0..1000 {
-            let decision = child.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
+            let decision = simulation.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
             assert_eq!(decision, RestartDecision::Restart(FIRST_PAUSE));
         }
     }
