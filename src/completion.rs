@@ -129,8 +129,11 @@ mod tests {
 
     #[test]
     fn presets_and_keys_are_completed() {
-        let presets = values(presets_and_files(OsStr::new("point-mass-r3")));
-        assert_eq!(presets, ["point-mass-r3", "point-mass-r3-sac", "point-mass-r3-td3"]);
+        let completed = values(presets_and_files(OsStr::new("point-mass-r3")));
+        let presets: Vec<&str> = preset_names()
+            .filter(|name| name.starts_with("point-mass-r3"))
+            .collect();
+        assert_eq!(completed, presets);
         assert_eq!(values(presets_and_files(OsStr::new("gy"))), ["gym:"]);
         assert_eq!(values(settings(OsStr::new("ddpg.ta"))), ["ddpg.tau="]);
         assert_eq!(

@@ -453,9 +453,9 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send. Tells the other hosts if
-    /// the run is over, even if the request to end it arrives while the roles end. They are not told, and wait, if the
-    /// run is renewed or to be resumed, or has failed (`None`).
+    /// Ends all roles, the actors first, so that the learner still receives what they send. If the run is over, the
+    /// other hosts are told, even if the request for that comes only while the roles end. They are not told, and wait,
+    /// after a failure (`None`), and if the run is renewed or to be resumed.
     fn end_all(&mut self, ending: Option<EndReason>) -> anyhow::Result<()> {
         let hosts_wait = self.hosts_wait;
         self.phase = match ending {

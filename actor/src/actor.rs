@@ -235,10 +235,10 @@ impl<'a> Actor<'a> {
         // A row of n steps is complete n − 1 steps after it began.
         let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
-        // The number is explicit, because a new server would begin with episode 0 again. Each step and each fault
-        // begins at most one episode of an environment, so no row that this process has sent is of this episode or a
-        // later one. After an invalid answer another episode begins, because the same one may end in the same way. With
-        // snapshots it is the same one: there the bits must not depend on what was not sent.
+        // A new server would begin with episode 0 again, so the episode is named. Each step and each fault begins at
+        // most one in each environment, so this number is above those of all episodes that have sent rows; and after an
+        // invalid answer it is another episode, because the same one may end in the same way. With snapshots faults do
+        // not count: there the bits must not depend on what was not sent.
         let faults = match self.settings.chunk.actor_snapshot_words {
             0 => self.faults,
             _ => 0,

@@ -16,9 +16,9 @@ const EPISODE_BITS: u32 = 40;
 
 /// `count` environments of one kind, each in its own episode.
 ///
-/// All random numbers of training episode k of environment e come from stream (e, k) of `stream(seed, Environment,
-/// server, stream)`, all random numbers of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an episode
-/// does not depend on what was run before it.
+/// All random numbers of training episode k of environment e come from part (e, k) of the stream (seed, Environment,
+/// server, incarnation); those of evaluation episode k from the stream (seed, Evaluation, k, 0). So an episode does not
+/// depend on what was run before it.
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,
@@ -73,16 +73,16 @@ pub enum Reset<'a> {
 
 impl VectorEnvironment {
     /// Makes `count` environments (below 2²⁴) from `name` and `parameters`. `seed`, `server` (the server's index) and
-    /// `stream` select the random streams of training episodes. Call `reset` before the first `step`.
+    /// `incarnation` select the random streams of training episodes. Call `reset` before the first `step`.
     pub fn new(
         name: &str,
         parameters: &toml::Table,
         count: u32,
         seed: u64,
         server: u64,
-        stream: u64,
+        incarnation: u64,
     ) -> Result<Self, EnvironmentError> {
-        Self::from_factory(|| make(name, parameters), count, (seed, server, stream))
+        Self::from_factory(|| make(name, parameters), count, (seed, server, incarnation))
     }
 
     /// As [`new`](Self::new), for environments that `make` makes.
@@ -92,11 +92,11 @@ impl VectorEnvironment {
     pub fn from_factory<E>(
         make: impl Fn() -> Result<Box<dyn Environment>, E>,
         count: u32,
-        (seed, server, stream): (u64, u64, u64),
+        (seed, server, incarnation): (u64, u64, u64),
     ) -> Result<Self, E> {
         let scratch = make()?;
         let spec = scratch.spec();
-        let training = stream::stream(seed, Purpose::Environment, server, stream);
+        let training = stream::stream(seed, Purpose::Environment, server, incarnation);
         let running = |_| {
             let environment = make()?;
             Ok(Running {

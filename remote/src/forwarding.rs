@@ -20,11 +20,12 @@ pub enum ChunkOrder {
     Early,
 }
 
-/// How far the chunks of one actor have been forwarded.
+/// How far the chunks of one actor have been forwarded. Ids of chunks in flight are those in the headers, where a
+/// handshake has sequence number 0; the committed id is that in the commit record.
 #[derive(Clone, Debug)]
 pub struct Forwarding {
     committed: ChunkId,
-    /// The numbers in the headers of the chunks forwarded and not committed, in order.
+    /// The ids of the chunks forwarded and not committed, in order.
     in_flight: VecDeque<ChunkId>,
     /// The most of them: as many as the history of the learner's channel has.
     window: usize,

@@ -245,7 +245,7 @@ impl<'a> Gate<'a> {
 
     fn run(&mut self) -> Result<(), GateError> {
         loop {
-            // The senders stay as long as the session, which is ours.
+            // The channel is never closed: its senders live as long as the session, which the gate owns.
             let first = self.arrivals.recv_timeout(self.sleep).ok();
             let more: Vec<Arrival> = self.arrivals.try_iter().collect();
             let mut forwarded_rows = 0;
@@ -775,7 +775,7 @@ impl<'a> Gate<'a> {
         self.sleep = match (waits, progress) {
             (true, true) => SHORTEST_SLEEP,
             (true, false) => (2 * self.sleep).min(LONGEST_SLEEP),
-            // The acknowledgement of this progress may have to wait for that long.
+            // The acknowledgement may have to wait for the least interval.
             (false, true) => SHORTEST_ACKNOWLEDGEMENT_INTERVAL,
             (false, false) => LONGEST_SLEEP,
         };

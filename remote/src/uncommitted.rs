@@ -40,10 +40,10 @@ pub struct UncommittedChunks<C> {
     furthest_sent: ChunkId,
 }
 
-/// A chunk to be sent.
+/// A chunk to be sent. Its ids are those in the headers, where a handshake has sequence number 0.
 #[derive(Debug)]
 pub struct KeptChunk<C> {
-    /// Its id, from its header.
+    /// Its id.
     pub id: ChunkId,
     /// The id of the chunk before it.
     previous: ChunkId,

@@ -7,7 +7,7 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_report::figure::{self, CurvesOfSetting, DiagramAxes};
 
 use super::claim::{Claim, median, percent, spread};
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 use super::result::SeedResult;
@@ -56,7 +56,7 @@ const fn experiment(name: &'static str, settings: &'static [&'static str]) -> Ex
         settings,
         quick: &["evaluation.every=500", "evaluation.final_episodes=10"],
         seeds: 10,
-        stages: &[Stage {
+        milestones: &[Milestone {
             suffix: "",
             length: Length::Episodes(EPISODES),
             quick_length: Length::Episodes(60),
@@ -145,7 +145,7 @@ impl Family for CartPole {
     type Measurements = TrainingHistory;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<TrainingHistory> {
+    fn measure(trained: &TrainedRun, _: &Milestone) -> anyhow::Result<TrainingHistory> {
         let episodes = trained.episodes()?;
         let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
         Ok(TrainingHistory::of(&returns, is_dead(trained)?))
@@ -397,15 +397,15 @@ mod tests {
         let nothing = claims([&[], &[], &[], &[]]);
         assert!(nothing.iter().all(|claim| claim.held().is_empty()));
         assert!(
-            nothing[0].ours.contains("after episode 1,000: —;"),
+            nothing[0].measured.contains("after episode 1,000: —;"),
             "{}",
-            nothing[0].ours
+            nothing[0].measured
         );
-        assert!(nothing[2].ours.starts_with("— times"), "{}", nothing[2].ours);
+        assert!(nothing[2].measured.starts_with("— times"), "{}", nothing[2].measured);
         let short = of(&history(&[(60, 20.0)]));
         assert!(
             claims([&short, &short, &short, &short])[0]
-                .ours
+                .measured
                 .contains("after episode 1,000: —;"),
             "a training that is too short has no mean after episode 1,000"
         );

@@ -8,11 +8,11 @@ use super::experiment::Effort;
 #[derive(Clone, Debug)]
 pub(super) struct Claim {
     /// In the thesis's words, or close to them.
-    pub(super) thesis: &'static str,
+    pub(super) statement: &'static str,
     /// The condition under which the claim holds.
     pub(super) criterion: &'static str,
     /// What was measured.
-    pub(super) ours: String,
+    pub(super) measured: String,
     check: Check,
 }
 
@@ -32,11 +32,11 @@ pub(super) enum Verdict {
     NotChecked,
     /// It holds for more than half of the seeds.
     Holds {
-        of: usize,
+        seeds: usize,
         held: usize,
     },
     Fails {
-        of: usize,
+        seeds: usize,
         held: usize,
     },
     /// It holds for the seeds together.
@@ -47,25 +47,30 @@ pub(super) enum Verdict {
 impl Claim {
     /// A claim that is checked for each seed separately. `held` has a value for each seed that could be checked.
     pub(super) fn each_seed(
-        thesis: &'static str,
+        statement: &'static str,
         criterion: &'static str,
-        ours: String,
+        measured: String,
         held: impl IntoIterator<Item = bool>,
     ) -> Self {
         Self {
-            thesis,
+            statement,
             criterion,
-            ours,
+            measured,
             check: Check::EachSeed(held.into_iter().collect()),
         }
     }
 
     /// A claim that is checked for all seeds together; `held` is `None` if results are missing.
-    pub(super) fn together(thesis: &'static str, criterion: &'static str, ours: String, held: Option<bool>) -> Self {
+    pub(super) fn together(
+        statement: &'static str,
+        criterion: &'static str,
+        measured: String,
+        held: Option<bool>,
+    ) -> Self {
         Self {
-            thesis,
+            statement,
             criterion,
-            ours,
+            measured,
             check: Check::Together(held),
         }
     }
@@ -78,14 +83,14 @@ impl Claim {
             Check::Together(None) => Verdict::NotChecked,
             Check::Together(Some(true)) => Verdict::HoldsTogether,
             Check::Together(Some(false)) => Verdict::FailsTogether,
-            Check::EachSeed(seeds) => {
-                let (of, held) = (seeds.len(), seeds.iter().filter(|held| **held).count());
-                if of == 0 {
+            Check::EachSeed(each) => {
+                let (seeds, held) = (each.len(), each.iter().filter(|held| **held).count());
+                if seeds == 0 {
                     Verdict::NotChecked
-                } else if 2 * held > of {
-                    Verdict::Holds { of, held }
+                } else if 2 * held > seeds {
+                    Verdict::Holds { seeds, held }
                 } else {
-                    Verdict::Fails { of, held }
+                    Verdict::Fails { seeds, held }
                 }
             }
         }
@@ -107,11 +112,11 @@ impl Display for Verdict {
             Self::NotChecked => write!(f, "not checked"),
             Self::HoldsTogether => write!(f, "**holds**"),
             Self::FailsTogether => write!(f, "**does not hold**"),
-            Self::Holds { of: 1, .. } => write!(f, "**holds** for the only seed"),
-            Self::Fails { of: 1, .. } => write!(f, "**does not hold** for the only seed"),
-            Self::Holds { of, held } if of == held => write!(f, "**holds** for all {of} seeds"),
-            Self::Holds { of, held } => write!(f, "**holds** for {held} of {of} seeds"),
-            Self::Fails { of, held } => write!(f, "**does not hold**; true for {held} of {of} seeds"),
+            Self::Holds { seeds: 1, .. } => write!(f, "**holds** for the only seed"),
+            Self::Fails { seeds: 1, .. } => write!(f, "**does not hold** for the only seed"),
+            Self::Holds { seeds, held } if seeds == held => write!(f, "**holds** for all {seeds} seeds"),
+            Self::Holds { seeds, held } => write!(f, "**holds** for {held} of {seeds} seeds"),
+            Self::Fails { seeds, held } => write!(f, "**does not hold**; true for {held} of {seeds} seeds"),
         }
     }
 }
@@ -169,8 +174,8 @@ mod tests {
     #[test]
     fn a_claim_holds_if_it_holds_for_more_than_half_of_the_seeds() {
         let verdict = |held: &[bool]| claim(held).verdict(Effort::Full);
-        assert_eq!(verdict(&[true, true, false]), Verdict::Holds { of: 3, held: 2 });
-        assert_eq!(verdict(&[true, false]), Verdict::Fails { of: 2, held: 1 });
+        assert_eq!(verdict(&[true, true, false]), Verdict::Holds { seeds: 3, held: 2 });
+        assert_eq!(verdict(&[true, false]), Verdict::Fails { seeds: 2, held: 1 });
         assert_eq!(verdict(&[]), Verdict::NotChecked);
         let together = |held| Claim::together("it works", "it does", String::new(), Some(held));
         assert_eq!(together(true).verdict(Effort::Full).to_string(), "**holds**");

@@ -1,4 +1,4 @@
-//! An experiment is a preset with settings, run in one or more stages.
+//! An experiment is a preset with settings. Its results are stored at one or more milestones of its run.
 
 use std::fmt::{self, Display};
 
@@ -30,13 +30,13 @@ pub(super) struct Experiment {
     /// Default number of seeds.
     pub(super) seeds: u32,
     /// Points of the same run at which results are stored, in ascending order of length.
-    pub(super) stages: &'static [Stage],
+    pub(super) milestones: &'static [Milestone],
 }
 
 /// A point of a run at which its result is stored.
 #[derive(Debug)]
-pub(super) struct Stage {
-    /// Distinguishes the results of an experiment's stages; empty for the first stage.
+pub(super) struct Milestone {
+    /// Distinguishes the results of an experiment's milestones; empty for the first milestone.
     pub(super) suffix: &'static str,
     /// Counted from the start of the run.
     pub(super) length: Length,
@@ -63,7 +63,7 @@ pub(super) struct Progress {
 
 impl Length {
     /// How much of this length a run has done, and the length itself, both in its unit.
-    pub(super) fn progress(self, progress: Progress) -> (u64, u64) {
+    pub(super) fn done_and_total(self, progress: Progress) -> (u64, u64) {
         match self {
             Self::Steps(steps) => (progress.steps, steps),
             Self::Episodes(episodes) => (progress.episodes, episodes),
@@ -106,13 +106,13 @@ impl Experiment {
         }
     }
 
-    /// The length of a finished run, which is the length of its last stage.
+    /// The length of a finished run, which is the length of its last milestone.
     pub(super) fn length(&self, effort: Effort) -> Option<Length> {
-        self.stages.last().map(|stage| stage.length(effort))
+        self.milestones.last().map(|milestone| milestone.length(effort))
     }
 }
 
-impl Stage {
+impl Milestone {
     pub(super) fn length(&self, effort: Effort) -> Length {
         match effort {
             Effort::Full => self.length,

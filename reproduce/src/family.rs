@@ -15,10 +15,10 @@ use shoal_run::records::recorder::{EpisodeRecord, read_episodes, read_evaluation
 use shoal_run::signals::Interrupt;
 use shoal_run::status::saved_status;
 
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::folder::Folder;
 use super::report_section::{FigureWriter, ReportSection};
-use super::result::{Evaluation, Header, Policy, SeedResult};
+use super::result::{EvaluatedPolicy, Evaluation, ResultHeader, SeedResult};
 use super::settings::RunSettings;
 
 /// A family of related experiments. A new family implements this trait and has a line in [`super::FAMILIES`].
@@ -29,8 +29,8 @@ pub(super) trait Family {
     /// The experiments of this family.
     const EXPERIMENTS: &'static [Experiment];
 
-    /// Measures a run that has just reached the end of `stage`.
-    fn measure(trained: &TrainedRun, stage: &Stage) -> anyhow::Result<Self::Measurements>;
+    /// Measures a run that has just reached `milestone`.
+    fn measure(trained: &TrainedRun, milestone: &Milestone) -> anyhow::Result<Self::Measurements>;
 
     /// Checks the thesis's claims and draws its figures, from stored results alone.
     fn sections(results: &Results<Self::Measurements>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
@@ -94,7 +94,7 @@ pub(super) struct Results<T> {
 }
 
 impl<T> Results<T> {
-    /// The results of a stage of an experiment, ordered by seed.
+    /// The results of a milestone of an experiment, ordered by seed.
     pub(super) fn of(&self, experiment: &'static str, suffix: &'static str) -> &[SeedResult<T>] {
         self.by_name.get(&(experiment, suffix)).map_or(&[], Vec::as_slice)
     }
@@ -115,8 +115,9 @@ impl<T> Results<T> {
 #[derive(Debug)]
 pub(super) struct FamilyEntry {
     pub(super) experiments: &'static [Experiment],
-    /// Makes and stores the result of a run that has reached the end of a stage.
-    pub(super) store_result: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
+    /// Makes and stores the result of a run that has reached a milestone.
+    pub(super) store_result:
+        fn(&Folder, &'static Experiment, &Milestone, u64, Length, &RunSettings) -> anyhow::Result<()>,
     /// Makes the report's sections from the results in the folder.
     pub(super) sections: fn(&Folder, &FigureWriter) -> anyhow::Result<Vec<ReportSection>>,
 }
@@ -130,20 +131,20 @@ pub(super) const fn entry<F: Family>() -> FamilyEntry {
     }
 }
 
-/// Makes the result of a run that has reached the end of `stage`, and stores it in the folder.
+/// Makes the result of a run that has reached `milestone`, and stores it in the folder.
 fn store_result<F: Family>(
     folder: &Folder,
     experiment: &'static Experiment,
-    stage: &Stage,
+    milestone: &Milestone,
     seed: u64,
     length: Length,
     settings: &RunSettings,
 ) -> anyhow::Result<()> {
     let trained = TrainedRun::open(folder, experiment, seed, settings)?;
-    let evaluate = |policy: &PolicyFile| -> anyhow::Result<Policy> {
+    let evaluate = |policy: &PolicyFile| -> anyhow::Result<EvaluatedPolicy> {
         let config = &trained.config;
         let episodes = config.evaluation.final_episodes;
-        Ok(Policy {
+        Ok(EvaluatedPolicy {
             steps: policy.env_steps,
             evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
         })
@@ -158,20 +159,20 @@ fn store_result<F: Family>(
         .collect();
     evaluations.sort_by_key(|evaluation| evaluation.steps);
     let result = SeedResult {
-        header: Header::new(experiment, seed, length, &RunSettings::of(&trained.config)?),
+        header: ResultHeader::new(experiment, seed, length, &RunSettings::of(&trained.config)?),
         evaluations,
         best: evaluate(&trained.best)?,
         last: evaluate(&trained.last)?,
-        measurements: F::measure(&trained, stage)?,
+        measurements: F::measure(&trained, milestone)?,
     };
-    folder.add(experiment, stage, &result)
+    folder.add(experiment, milestone, &result)
 }
 
 fn sections<F: Family>(folder: &Folder, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
     let mut by_name = BTreeMap::new();
     for experiment in F::EXPERIMENTS {
-        for stage in experiment.stages {
-            by_name.insert((experiment.name, stage.suffix), folder.read(experiment, stage)?);
+        for milestone in experiment.milestones {
+            by_name.insert((experiment.name, milestone.suffix), folder.read(experiment, milestone)?);
         }
     }
     F::sections(&Results { by_name }, writer)

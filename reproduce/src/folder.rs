@@ -11,8 +11,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use shoal_common::file_lock;
 
-use super::experiment::{Effort, Experiment, Stage};
-use super::result::{self, Header, SeedResult};
+use super::experiment::{Effort, Experiment, Milestone};
+use super::result::{self, ResultHeader, SeedResult};
 use super::results_file::{ResultsFile, numbered};
 use super::settings::RunSettings;
 
@@ -60,26 +60,26 @@ impl Folder {
         self.path.join(experiment.name).join(format!("seed-{seed}"))
     }
 
-    /// Whether there is a result for this seed and stage.
-    pub(super) fn has(&self, experiment: &Experiment, stage: &Stage, seed: u64) -> bool {
-        self.results()[experiment.name].has(stage, seed)
+    /// Whether there is a result for this seed and milestone.
+    pub(super) fn has(&self, experiment: &Experiment, milestone: &Milestone, seed: u64) -> bool {
+        self.results()[experiment.name].has(milestone, seed)
     }
 
-    /// The seeds that have a result for this stage, in ascending order.
-    pub(super) fn seeds(&self, experiment: &Experiment, stage: &Stage) -> Vec<u64> {
+    /// The seeds that have a result for this milestone, in ascending order.
+    pub(super) fn seeds(&self, experiment: &Experiment, milestone: &Milestone) -> Vec<u64> {
         let results = self.results();
-        results[experiment.name].of(stage).map(|(seed, _)| seed).collect()
+        results[experiment.name].of(milestone).map(|(seed, _)| seed).collect()
     }
 
-    /// The results of a stage, ordered by seed.
+    /// The results of a milestone, ordered by seed.
     pub(super) fn read<T: DeserializeOwned>(
         &self,
         experiment: &Experiment,
-        stage: &Stage,
+        milestone: &Milestone,
     ) -> anyhow::Result<Vec<SeedResult<T>>> {
         let results = self.results();
         results[experiment.name]
-            .of(stage)
+            .of(milestone)
             .map(|(_, line)| result::read(line))
             .collect()
     }
@@ -88,22 +88,22 @@ impl Folder {
     pub(super) fn add<T: Serialize>(
         &self,
         experiment: &Experiment,
-        stage: &Stage,
+        milestone: &Milestone,
         result: &SeedResult<T>,
     ) -> anyhow::Result<()> {
         let text = serde_json::to_string(result)?;
         let mut results = self.results();
         let file = results.get_mut(experiment.name);
         file.context("the folder was opened for other experiments")?
-            .add(&text, stage)
+            .add(&text, milestone)
     }
 
     /// Returns an error if the folder has results or runs of this experiment that were made with other settings.
     pub(super) fn check(&self, experiment: &Experiment, effort: Effort, settings: &RunSettings) -> anyhow::Result<()> {
-        for stage in experiment.stages {
-            for (seed, line) in self.results()[experiment.name].of(stage) {
-                let length = stage.length(effort);
-                Header::read(line)?.check(&line.place, experiment, seed, length, settings)?;
+        for milestone in experiment.milestones {
+            for (seed, line) in self.results()[experiment.name].of(milestone) {
+                let length = milestone.length(effort);
+                ResultHeader::read(line)?.check(&line.place, experiment, seed, length, settings)?;
             }
         }
         for seed in numbered(&self.path.join(experiment.name), "")? {
@@ -152,14 +152,14 @@ mod tests {
                 let folder = &folder;
                 scope.spawn(move || {
                     let result = result(experiment, seed, seed as f64, ());
-                    folder.add(experiment, &experiment.stages[0], &result).unwrap();
+                    folder.add(experiment, &experiment.milestones[0], &result).unwrap();
                 });
             }
         });
         drop(folder);
         let folder = Folder::open(directory.path(), [experiment]).unwrap();
-        let [first, second] = experiment.stages else {
-            panic!("two stages")
+        let [first, second] = experiment.milestones else {
+            panic!("two milestones")
         };
         assert_eq!(folder.seeds(experiment, first), (1..=8).collect::<Vec<_>>());
         assert!(folder.has(experiment, first, 8) && !folder.has(experiment, second, 8));

@@ -11,7 +11,7 @@ use shoal_run::evaluation::analysis::lake::{ExpectedResult, LIMIT, greedy, optim
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::recorder::read_evaluations;
 
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::family::{Family, Results, TrainedRun};
 use super::report_section::{Figure, FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
@@ -77,7 +77,7 @@ const fn experiment(name: &'static str, preset: &'static str, settings: &'static
         settings,
         quick: &["evaluation.every=200", "evaluation.final_episodes=10"],
         seeds: 10,
-        stages: &[Stage {
+        milestones: &[Milestone {
             suffix: "",
             length: Length::Episodes(EPISODES),
             quick_length: Length::Episodes(40),
@@ -143,7 +143,7 @@ impl Family for FrozenLake {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, _: &Milestone) -> anyhow::Result<Measurements> {
         let TrainedRun { config, run, last, .. } = trained;
         let layout = policy_layout(config)?;
         let mut steps = 0;

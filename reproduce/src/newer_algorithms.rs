@@ -8,7 +8,7 @@ pub(super) use point_mass::PointMassAlgorithms;
 
 use shoal_report::figure;
 
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::report_section::{Figure, FigureWriter};
 use super::result::SeedResult;
 
@@ -20,7 +20,7 @@ const fn experiment(
     name: &'static str,
     seeds: u32,
     (settings, quick): (&'static [&'static str], &'static [&'static str]),
-    stages: &'static [Stage],
+    milestones: &'static [Milestone],
 ) -> Experiment {
     Experiment {
         name,
@@ -29,12 +29,12 @@ const fn experiment(
         settings,
         quick,
         seeds,
-        stages,
+        milestones,
     }
 }
 
-const fn stage(steps: u64) -> Stage {
-    Stage {
+const fn milestone(steps: u64) -> Milestone {
+    Milestone {
         suffix: "",
         length: Length::Steps(steps),
         quick_length: Length::Steps(2_000),

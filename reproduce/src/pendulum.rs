@@ -6,7 +6,7 @@ use shoal_run::evaluation::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::claim::{Claim, spread};
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
@@ -25,7 +25,7 @@ pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
         "evaluation.final_episodes=10",
     ],
     seeds: 5,
-    stages: &[Stage {
+    milestones: &[Milestone {
         suffix: "",
         length: Length::Steps(120_000),
         quick_length: Length::Steps(4_000),
@@ -52,7 +52,7 @@ impl Family for Pendulum {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, _: &Milestone) -> anyhow::Result<Measurements> {
         let run = |parameters| SwingUp::run(&mut Rollout::new(&trained.config, parameters)?);
         let best = run(&trained.best.parameters)?;
         Ok(Measurements {

@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, Measures, NEAR_STARTS, TestRun};
 use shoal_run::evaluation::rollout::Rollout;
 
-use super::experiment::{Experiment, Length, Stage};
+use super::experiment::{Experiment, Length, Milestone};
 use super::family::{Family, Results, TrainedRun};
 use super::report_section::{FigureWriter, ReportSection};
 
-/// The suffix of the stage after the additional training with r2.
+/// The suffix of the milestone after the additional training with r2.
 const LONGER: &str = "-longer";
 
 const QUICK: &[&str] = &[
@@ -24,15 +24,15 @@ const QUICK: &[&str] = &[
 
 /// 4000 episodes of 200 steps for r1, 2000 for r2 and r3, and 4000 for r2 in appendix A.1.
 pub(super) const EXPERIMENTS: [Experiment; 3] = [
-    experiment("point-mass-r1", &[stage("", 800_000, 8_000)]),
+    experiment("point-mass-r1", &[milestone("", 800_000, 8_000)]),
     experiment(
         "point-mass-r2",
-        &[stage("", 400_000, 8_000), stage(LONGER, 800_000, 16_000)],
+        &[milestone("", 400_000, 8_000), milestone(LONGER, 800_000, 16_000)],
     ),
-    experiment("point-mass-r3", &[stage("", 400_000, 8_000)]),
+    experiment("point-mass-r3", &[milestone("", 400_000, 8_000)]),
 ];
 
-const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment {
+const fn experiment(name: &'static str, milestones: &'static [Milestone]) -> Experiment {
     Experiment {
         name,
         cli_name: name,
@@ -40,12 +40,12 @@ const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment 
         settings: &[],
         quick: QUICK,
         seeds: 5,
-        stages,
+        milestones,
     }
 }
 
-const fn stage(suffix: &'static str, steps: u64, quick_steps: u64) -> Stage {
-    Stage {
+const fn milestone(suffix: &'static str, steps: u64, quick_steps: u64) -> Milestone {
+    Milestone {
         suffix,
         length: Length::Steps(steps),
         quick_length: Length::Steps(quick_steps),
@@ -82,12 +82,16 @@ impl Family for PointMass {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, stage: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, milestone: &Milestone) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let run = |parameters| TestRun::from_starts(&mut Rollout::new(&trained.config, parameters)?, &starts);
         let best = run(&trained.best.parameters)?;
         let last = run(&trained.last.parameters)?;
-        let shown = if stage.suffix == LONGER { NEAR_STARTS.len() } else { 0 };
+        let shown = if milestone.suffix == LONGER {
+            NEAR_STARTS.len()
+        } else {
+            0
+        };
         Ok(Measurements {
             best: best.iter().map(TestRun::measures).collect(),
             last: last.iter().map(TestRun::measures).collect(),

@@ -41,11 +41,11 @@ struct Due {
 impl Due {
     fn done(&self, run: &Path) -> Option<u64> {
         let (steps, episodes) = recorded(&RunDir::at(run)).ok()??;
-        Some(self.length.progress(experiment::Progress { steps, episodes }).0)
+        Some(self.length.done_and_total(experiment::Progress { steps, episodes }).0)
     }
 
     fn total(&self) -> u64 {
-        self.length.progress(experiment::Progress::default()).1
+        self.length.done_and_total(experiment::Progress::default()).1
     }
 }
 
@@ -63,7 +63,7 @@ impl<'a> ProgressDisplay<'a> {
                 // If the run cannot be read, the error is reported when the job starts.
                 let state = SeedState::of(&folder.run(job.experiment, job.seed)).unwrap_or(SeedState::Absent);
                 let length = job.experiment.length(effort)?;
-                let begin = length.progress(state.progress()).0;
+                let begin = length.done_and_total(state.progress()).0;
                 Some((job.name(), Due { length, begin }))
             })
             .collect();

@@ -77,33 +77,38 @@ impl SeedQueue<'_> {
     }
 
     fn is_due(&self, job: &Job) -> bool {
-        let mut stages = job.experiment.stages.iter();
-        stages.any(|stage| !self.folder.has(job.experiment, stage, job.seed))
+        let mut milestones = job.experiment.milestones.iter();
+        milestones.any(|milestone| !self.folder.has(job.experiment, milestone, job.seed))
     }
 
     fn work(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) {
         // A closed channel does not end the work: the results are still stored.
         let _ = events.send(Event::Started(job));
-        match self.run_stages(job, signals, events) {
+        match self.reach_milestones(job, signals, events) {
             Ok(TrainingEnd::Finished) => _ = events.send(Event::Finished(job)),
             Ok(TrainingEnd::Interrupted) => {}
             Err(error) => _ = events.send(Event::Failed(job, error)),
         }
     }
 
-    fn run_stages(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<TrainingEnd> {
+    fn reach_milestones(
+        &self,
+        job: Job,
+        signals: &Signals,
+        events: &mpsc::Sender<Event>,
+    ) -> anyhow::Result<TrainingEnd> {
         let Job {
             family,
             experiment,
             seed,
         } = job;
         let run = self.folder.run(experiment, seed);
-        for stage in experiment.stages {
-            if self.folder.has(experiment, stage, seed) {
+        for milestone in experiment.milestones {
+            if self.folder.has(experiment, milestone, seed) {
                 continue;
             }
-            let length = stage.length(self.effort);
-            let (done, total) = length.progress(SeedState::of(&run)?.progress());
+            let length = milestone.length(self.effort);
+            let (done, total) = length.done_and_total(SeedState::of(&run)?.progress());
             if matches!(length, Length::Steps(_)) && done > total {
                 bail!(
                     "{} has trained beyond {length} without a stored result: remove the run directory to start the \
@@ -117,7 +122,7 @@ impl SeedQueue<'_> {
             (family.store_result)(
                 self.folder,
                 experiment,
-                stage,
+                milestone,
                 seed,
                 length,
                 &self.settings[experiment.name],

@@ -9,7 +9,7 @@ use anyhow::Context;
 use shoal_common::durable::write_atomically;
 
 use super::claim::{Claim, Verdict};
-use super::experiment::{Effort, Experiment, Stage};
+use super::experiment::{Effort, Experiment, Milestone};
 use super::family::FamilyEntry;
 use super::folder::Folder;
 use super::report_section::{Figure, FigureWriter, ReportSection};
@@ -27,18 +27,18 @@ pub(super) fn write(
     let writer = FigureWriter::in_directory(figures.clone(), request.png)?;
     let mut sections = Vec::new();
     for family in families {
-        let stages = Stages {
+        let milestones = Milestones {
             family,
             folder,
             jobs,
             failures,
             effort: request.effort,
         };
-        if !stages.are_in_report() {
+        if !milestones.are_in_report() {
             continue;
         }
         for section in (family.sections)(folder, &writer)? {
-            if let Some(seeds) = stages.seeds_of(&section) {
+            if let Some(seeds) = milestones.seeds_of(&section) {
                 let notes = notes(folder, &section.from)?;
                 sections.push((section, seeds, notes));
             }
@@ -52,8 +52,8 @@ pub(super) fn write(
     Ok(())
 }
 
-/// The stages of a family, with their results and failures.
-struct Stages<'a> {
+/// The milestones of a family, with their results and failures.
+struct Milestones<'a> {
     family: &'a FamilyEntry,
     folder: &'a Folder,
     jobs: &'a [Job],
@@ -76,14 +76,19 @@ fn notes(folder: &Folder, from: &[(&str, &str)]) -> anyhow::Result<String> {
     }
 }
 
-impl Stages<'_> {
+impl Milestones<'_> {
     /// Whether results of the family were requested or exist.
     fn are_in_report(&self) -> bool {
         let mut experiments = self.family.experiments.iter();
-        experiments.any(|experiment| experiment.stages.iter().any(|stage| self.line(experiment, stage).1))
+        experiments.any(|experiment| {
+            experiment
+                .milestones
+                .iter()
+                .any(|milestone| self.line(experiment, milestone).1)
+        })
     }
 
-    /// The seeds that a section uses and the seeds that are missing, a line for each stage. `None` if none were
+    /// The seeds that a section uses and the seeds that are missing, a line for each milestone. `None` if none were
     /// requested and none exist.
     fn seeds_of(&self, section: &ReportSection) -> Option<Vec<String>> {
         let (mut lines, mut in_report) = (Vec::new(), false);
@@ -93,9 +98,10 @@ impl Stages<'_> {
                 .experiments
                 .iter()
                 .find(|experiment| experiment.name == *name);
-            let found = experiment.and_then(|it| Some((it, it.stages.iter().find(|stage| stage.suffix == *suffix)?)));
-            if let Some((experiment, stage)) = found {
-                let (line, line_in_report) = self.line(experiment, stage);
+            let found = experiment
+                .and_then(|it| Some((it, it.milestones.iter().find(|milestone| milestone.suffix == *suffix)?)));
+            if let Some((experiment, milestone)) = found {
+                let (line, line_in_report) = self.line(experiment, milestone);
                 lines.push(line);
                 in_report |= line_in_report;
             }
@@ -103,9 +109,9 @@ impl Stages<'_> {
         in_report.then_some(lines)
     }
 
-    /// The line of a stage, and whether any of its seeds were requested or exist.
-    fn line(&self, experiment: &Experiment, stage: &Stage) -> (String, bool) {
-        let found = self.folder.seeds(experiment, stage);
+    /// The line of a milestone, and whether any of its seeds were requested or exist.
+    fn line(&self, experiment: &Experiment, milestone: &Milestone) -> (String, bool) {
+        let found = self.folder.seeds(experiment, milestone);
         let requested = self.jobs.iter().filter(|job| job.experiment.name == experiment.name);
         let missing: Vec<u64> = requested
             .map(|job| job.seed)
@@ -115,7 +121,7 @@ impl Stages<'_> {
         let mut line = format!(
             "`{}`, {}: {}",
             experiment.name,
-            stage.length(self.effort),
+            milestone.length(self.effort),
             if found.is_empty() {
                 "no results yet".into()
             } else {
@@ -187,12 +193,16 @@ checked once.",
         }
         for claim in &section.claims {
             let Claim {
-                thesis,
+                statement,
                 criterion,
-                ours,
+                measured,
                 ..
             } = claim;
-            let _ = writeln!(text, "| {thesis} | {ours} | {criterion} | {} |", claim.verdict(effort));
+            let _ = writeln!(
+                text,
+                "| {statement} | {measured} | {criterion} | {} |",
+                claim.verdict(effort)
+            );
         }
         if !notes.is_empty() {
             let _ = write!(text, "\n{}\n", notes.trim_end());

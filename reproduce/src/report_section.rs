@@ -10,7 +10,7 @@ use super::claim::Claim;
 /// A part of the report.
 pub(super) struct ReportSection {
     pub(super) title: &'static str,
-    /// The results that it uses: experiments with the suffixes of their stages.
+    /// The results that it uses: experiments with the suffixes of their milestones.
     pub(super) from: Vec<(&'static str, &'static str)>,
     /// Markdown before the table of claims; may be empty.
     pub(super) remark: String,

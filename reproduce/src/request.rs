@@ -35,7 +35,7 @@ pub enum ReproductionEnd {
     Interrupted(i32),
 }
 
-/// One seed of one experiment, with all its stages.
+/// One seed of one experiment, with all its milestones.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Job {
     pub(super) family: &'static FamilyEntry,

@@ -15,7 +15,7 @@ const FORMAT: u32 = 1;
 
 /// The run that a result belongs to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Header {
+pub(super) struct ResultHeader {
     schema: u32,
     experiment: String,
     pub(super) seed: u64,
@@ -30,13 +30,13 @@ pub(super) struct Header {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct SeedResult<T> {
     #[serde(flatten)]
-    pub(super) header: Header,
+    pub(super) header: ResultHeader,
     /// All evaluations of the run, in order.
     pub(super) evaluations: Vec<Evaluation>,
     /// The policy with the best evaluation.
-    pub(super) best: Policy,
+    pub(super) best: EvaluatedPolicy,
     /// The policy at the end.
-    pub(super) last: Policy,
+    pub(super) last: EvaluatedPolicy,
     #[serde(rename = "tests")]
     pub(super) measurements: T,
 }
@@ -51,7 +51,7 @@ pub(super) struct Evaluation {
 
 /// A policy with its final evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Policy {
+pub(super) struct EvaluatedPolicy {
     /// Environment steps at which it was learned.
     pub(super) steps: u64,
     pub(super) evaluation: EvaluationSummary,
@@ -79,7 +79,7 @@ impl<T> SeedResult<T> {
     }
 }
 
-impl Header {
+impl ResultHeader {
     pub(super) fn new(experiment: &Experiment, seed: u64, length: Length, settings: &RunSettings) -> Self {
         Self {
             schema: FORMAT,
@@ -167,7 +167,7 @@ pub(super) mod tests {
 
     /// A result of this seed. The best policy has this return, and the last policy a slightly lower one.
     pub(crate) fn result<T>(experiment: &Experiment, seed: u64, return_mean: f64, measurements: T) -> SeedResult<T> {
-        let policy = |return_mean| Policy {
+        let policy = |return_mean| EvaluatedPolicy {
             steps: 1_000,
             evaluation: EvaluationSummary {
                 return_mean,
@@ -177,15 +177,15 @@ pub(super) mod tests {
                 reached_fraction: Some(0.99),
             },
         };
-        let length = experiment.stages[0].length;
-        let steps = length.progress(Progress::default()).1;
+        let length = experiment.milestones[0].length;
+        let steps = length.done_and_total(Progress::default()).1;
         let evaluation = |i: u64| Evaluation {
             steps: i * steps / 20,
             mean: return_mean * i.min(10) as f64 / 10.0,
             std: 1.0,
         };
         SeedResult {
-            header: Header::new(
+            header: ResultHeader::new(
                 experiment,
                 seed,
                 length,
@@ -211,7 +211,7 @@ pub(super) mod tests {
         let made = result(experiment(), 3, -150.25, vec![0.1, 3.25, -2e-5]);
         let line = line(&serde_json::to_string(&made).unwrap());
         assert_eq!(read::<Vec<f64>>(&line).unwrap(), made);
-        let header = Header::read(&line).unwrap();
+        let header = ResultHeader::read(&line).unwrap();
         assert_eq!(header, made.header);
         let settings = |tau| RunSettings::from_pairs(&[("ddpg.tau", tau), ("ddpg.new", "1")]);
         header
@@ -241,7 +241,7 @@ pub(super) mod tests {
             ("{\"schema\"", "not a result"),
             ("[]", "not a result"),
         ] {
-            let error = format!("{:#}", Header::read(&line(text)).unwrap_err());
+            let error = format!("{:#}", ResultHeader::read(&line(text)).unwrap_err());
             assert!(
                 error.contains(part) && error.contains("move the file away") && !error.contains('\n'),
                 "{error}"

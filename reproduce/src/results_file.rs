@@ -1,7 +1,7 @@
 //! The results of an experiment: one file, `<experiment>.jsonl.gz`. Its first line is the [`FirstLine`]; every other
-//! line is the result of one seed and stage, ordered by seed and stage.
+//! line is the result of one seed and milestone, ordered by seed and milestone.
 //!
-//! Earlier versions stored each result in its own file, `<experiment>/seed-N<stage>.json`. Such files are still read,
+//! Earlier versions stored each result in its own file, `<experiment>/seed-N<suffix>.json`. Such files are still read,
 //! and [`ResultsFile::move_old_results`] moves them into the new file.
 
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ use flate2::write::GzEncoder;
 use serde::{Deserialize, Serialize};
 use shoal_common::durable::write_atomically;
 
-use super::experiment::{Experiment, Stage};
+use super::experiment::{Experiment, Milestone};
 
 /// The version of the file format. Increase it with every change. Format 1 had a file for each result.
 const FORMAT: u32 = 2;
@@ -33,8 +33,9 @@ struct FirstLine {
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 struct Key {
     seed: u64,
-    /// The stage's suffix.
-    stage: String,
+    /// The milestone's suffix.
+    #[serde(rename = "stage")]
+    milestone: String,
 }
 
 /// A result as it is stored.
@@ -86,10 +87,10 @@ impl ResultsFile {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", results.path.display())),
         }
-        for stage in experiment.stages {
-            let ending = format!("{}.json", stage.suffix);
+        for milestone in experiment.milestones {
+            let ending = format!("{}.json", milestone.suffix);
             for seed in numbered(&results.directory, &ending)? {
-                results.read_old(seed, &ending, stage)?;
+                results.read_old(seed, &ending, milestone)?;
             }
         }
         Ok(results)
@@ -136,11 +137,11 @@ impl ResultsFile {
     }
 
     /// Reads a result in the old format.
-    fn read_old(&mut self, seed: u64, ending: &str, stage: &Stage) -> anyhow::Result<()> {
+    fn read_old(&mut self, seed: u64, ending: &str, milestone: &Milestone) -> anyhow::Result<()> {
         let path = self.directory.join(format!("seed-{seed}{ending}"));
         let here = path.display();
         let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {here}"))?;
-        let (key, text) = line(&text, stage).with_context(|| {
+        let (key, text) = line(&text, milestone).with_context(|| {
             format!("{here} is not a result of this program: move it away, and the result will be made again")
         })?;
         if key.seed != seed {
@@ -185,8 +186,8 @@ impl ResultsFile {
     }
 
     /// Adds a result, which is a JSON object, and writes the file.
-    pub(super) fn add(&mut self, result: &str, stage: &Stage) -> anyhow::Result<()> {
-        let (key, text) = line(result, stage)?;
+    pub(super) fn add(&mut self, result: &str, milestone: &Milestone) -> anyhow::Result<()> {
+        let (key, text) = line(result, milestone)?;
         let place = place(&self.path, &key);
         self.lines.insert(key.clone(), ResultLine { text, place, old: None });
         let written = self.write();
@@ -196,16 +197,16 @@ impl ResultsFile {
         written
     }
 
-    /// Whether there is a result for this seed and stage.
-    pub(super) fn has(&self, stage: &Stage, seed: u64) -> bool {
-        self.of(stage).any(|(found, _)| found == seed)
+    /// Whether there is a result for this seed and milestone.
+    pub(super) fn has(&self, milestone: &Milestone, seed: u64) -> bool {
+        self.of(milestone).any(|(found, _)| found == seed)
     }
 
-    /// Seeds and results of a stage, ordered by seed.
-    pub(super) fn of(&self, stage: &Stage) -> impl Iterator<Item = (u64, &ResultLine)> {
+    /// Seeds and results of a milestone, ordered by seed.
+    pub(super) fn of(&self, milestone: &Milestone) -> impl Iterator<Item = (u64, &ResultLine)> {
         self.lines
             .iter()
-            .filter(|(key, _)| key.stage == stage.suffix)
+            .filter(|(key, _)| key.milestone == milestone.suffix)
             .map(|(key, line)| (key.seed, line))
     }
 
@@ -228,16 +229,16 @@ impl ResultsFile {
 
 /// Describes a result in the file at `path`, for messages.
 fn place(path: &Path, key: &Key) -> String {
-    format!("{} (seed {}{})", path.display(), key.seed, key.stage)
+    format!("{} (seed {}{})", path.display(), key.seed, key.milestone)
 }
 
-/// The line of a result of this stage: the JSON object `result`, unchanged digit by digit, with the stage inserted as
-/// its first key.
-fn line(result: &str, stage: &Stage) -> anyhow::Result<(Key, String)> {
+/// The line of a result of this milestone: the JSON object `result`, unchanged digit by digit, with the milestone's
+/// suffix inserted as its first key.
+fn line(result: &str, milestone: &Milestone) -> anyhow::Result<(Key, String)> {
     // JSON has no line breaks inside strings or numbers.
     let result: String = result.lines().map(str::trim).collect();
     let rest = result.strip_prefix('{').context("it is not a JSON object")?;
-    let suffix = serde_json::to_string(stage.suffix)?;
+    let suffix = serde_json::to_string(milestone.suffix)?;
     let line = format!("{{\"stage\":{suffix},{rest}");
     Ok((serde_json::from_str(&line)?, line))
 }
@@ -272,15 +273,15 @@ mod tests {
     use super::super::pendulum::Pendulum;
     use super::super::point_mass::EXPERIMENTS;
     use super::super::result::tests::result;
-    use super::super::result::{self, Header, SeedResult};
+    use super::super::result::{self, ResultHeader, SeedResult};
     use super::*;
 
-    /// An experiment with two stages.
-    const TWO_STAGES: &Experiment = &EXPERIMENTS[1];
+    /// An experiment with two milestones.
+    const TWO_MILESTONES: &Experiment = &EXPERIMENTS[1];
 
-    /// A result of [`TWO_STAGES`] in the old format.
+    /// A result of [`TWO_MILESTONES`] in the old format.
     fn text(seed: u64, of: f64) -> String {
-        serde_json::to_string(&result(TWO_STAGES, seed, of, ())).unwrap()
+        serde_json::to_string(&result(TWO_MILESTONES, seed, of, ())).unwrap()
     }
 
     fn unpacked(path: &Path) -> String {
@@ -298,20 +299,20 @@ mod tests {
     }
 
     fn refused(folder: &Path) -> String {
-        let error = format!("{:#}", ResultsFile::read(folder, TWO_STAGES).unwrap_err());
+        let error = format!("{:#}", ResultsFile::read(folder, TWO_MILESTONES).unwrap_err());
         assert!(error.contains("point-mass-r2") && !error.contains('\n'), "{error}");
         error
     }
 
     #[test]
-    fn results_are_lines_ordered_by_seed_and_stage() {
+    fn results_are_lines_ordered_by_seed_and_milestone() {
         let folder = tempfile::tempdir().unwrap();
-        let [first, second] = TWO_STAGES.stages else {
-            panic!("two stages")
+        let [first, second] = TWO_MILESTONES.milestones else {
+            panic!("two milestones")
         };
-        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
-        for (stage, seed) in [(first, 10), (second, 2), (first, 2)] {
-            results.add(&text(seed, 0.1 + 0.2), stage).unwrap();
+        let mut results = ResultsFile::read(folder.path(), TWO_MILESTONES).unwrap();
+        for (milestone, seed) in [(first, 10), (second, 2), (first, 2)] {
+            results.add(&text(seed, 0.1 + 0.2), milestone).unwrap();
         }
         let path = folder.path().join("point-mass-r2.jsonl.gz");
         let written = unpacked(&path);
@@ -335,16 +336,16 @@ mod tests {
 
         // The order in which results are added does not matter.
         let other = tempfile::tempdir().unwrap();
-        let mut again = ResultsFile::read(other.path(), TWO_STAGES).unwrap();
-        for (stage, seed) in [(first, 2), (first, 10), (second, 2)] {
-            again.add(&text(seed, 0.1 + 0.2), stage).unwrap();
+        let mut again = ResultsFile::read(other.path(), TWO_MILESTONES).unwrap();
+        for (milestone, seed) in [(first, 2), (first, 10), (second, 2)] {
+            again.add(&text(seed, 0.1 + 0.2), milestone).unwrap();
         }
         assert_eq!(
             std::fs::read(other.path().join("point-mass-r2.jsonl.gz")).unwrap(),
             bytes
         );
-        let read = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
-        let seeds = |stage| read.of(stage).map(|(seed, _)| seed).collect::<Vec<_>>();
+        let read = ResultsFile::read(folder.path(), TWO_MILESTONES).unwrap();
+        let seeds = |milestone| read.of(milestone).map(|(seed, _)| seed).collect::<Vec<_>>();
         assert_eq!((seeds(first), seeds(second)), (vec![2, 10], vec![2]));
         assert!(read.has(second, 2) && !read.has(second, 10));
     }
@@ -352,18 +353,18 @@ mod tests {
     #[test]
     fn a_result_that_cannot_be_written_is_not_added() {
         let folder = tempfile::tempdir().unwrap();
-        let stage = &TWO_STAGES.stages[0];
-        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
-        results.add(&text(1, 1.0), stage).unwrap();
+        let milestone = &TWO_MILESTONES.milestones[0];
+        let mut results = ResultsFile::read(folder.path(), TWO_MILESTONES).unwrap();
+        results.add(&text(1, 1.0), milestone).unwrap();
         let kept = std::fs::read(folder.path().join("point-mass-r2.jsonl.gz")).unwrap();
         // This directory has the name of the temporary file.
         std::fs::create_dir(folder.path().join("point-mass-r2.jsonl.gz.new")).unwrap();
-        let error = results.add(&text(2, 1.0), stage).unwrap_err().to_string();
+        let error = results.add(&text(2, 1.0), milestone).unwrap_err().to_string();
         assert!(
             error.contains("cannot write") && error.contains("point-mass-r2.jsonl.gz"),
             "{error}"
         );
-        assert!(results.has(stage, 1) && !results.has(stage, 2));
+        assert!(results.has(milestone, 1) && !results.has(milestone, 2));
         assert_eq!(
             std::fs::read(folder.path().join("point-mass-r2.jsonl.gz")).unwrap(),
             kept
@@ -373,10 +374,10 @@ mod tests {
     #[test]
     fn results_in_the_old_format_are_moved() {
         let folder = tempfile::tempdir().unwrap();
-        let [first, second] = TWO_STAGES.stages else {
-            panic!("two stages")
+        let [first, second] = TWO_MILESTONES.milestones else {
+            panic!("two milestones")
         };
-        ResultsFile::read(folder.path(), TWO_STAGES)
+        ResultsFile::read(folder.path(), TWO_MILESTONES)
             .unwrap()
             .add(&text(3, 3.0), first)
             .unwrap();
@@ -391,7 +392,7 @@ mod tests {
         old("seed-4.json.new", "half");
         old("notes.txt", "mine");
 
-        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
+        let mut results = ResultsFile::read(folder.path(), TWO_MILESTONES).unwrap();
         let keys: Vec<_> = results.of(first).map(|(seed, _)| seed).collect();
         assert_eq!(keys, [1, 3, 12]);
         assert!(
@@ -407,7 +408,7 @@ mod tests {
         assert_eq!(left, ["notes.txt", "seed-1", "seed-4.json.new"]);
         let all = unpacked(&folder.path().join("point-mass-r2.jsonl.gz"));
         let wanted = [(1, 1.0, ""), (1, 2.0, "-longer"), (3, 3.0, ""), (12, 0.1 + 0.2, "")]
-            .map(|(seed, of, stage)| text(seed, of).replacen('{', &format!("{{\"stage\":\"{stage}\","), 1));
+            .map(|(seed, of, milestone)| text(seed, of).replacen('{', &format!("{{\"stage\":\"{milestone}\","), 1));
         assert_eq!(all.lines().skip(1).collect::<Vec<_>>(), wanted);
         assert!(
             results
@@ -440,11 +441,11 @@ mod tests {
         assert!(!directory.exists(), "the empty directory was removed");
 
         let results = ResultsFile::read(folder.path(), pendulum).unwrap();
-        let lines: Vec<_> = results.of(&pendulum.stages[0]).collect();
+        let lines: Vec<_> = results.of(&pendulum.milestones[0]).collect();
         let [(1, line)] = lines[..] else { panic!("{lines:?}") };
         let old_text = std::fs::read_to_string(&old).unwrap();
         assert_eq!(line.text.replacen("\"stage\":\"\",", "", 1), old_text.trim_end());
-        Header::read(line).unwrap();
+        ResultHeader::read(line).unwrap();
         let read: SeedResult<<Pendulum as Family>::Measurements> = result::read(line).unwrap();
         assert_eq!(read.evaluations.last().unwrap().steps, 4_000);
     }
@@ -474,9 +475,9 @@ mod tests {
     fn damaged_and_foreign_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("point-mass-r2.jsonl.gz");
-        ResultsFile::read(folder.path(), TWO_STAGES)
+        ResultsFile::read(folder.path(), TWO_MILESTONES)
             .unwrap()
-            .add(&text(1, 1.0), &TWO_STAGES.stages[0])
+            .add(&text(1, 1.0), &TWO_MILESTONES.milestones[0])
             .unwrap();
         let (whole, lines) = (std::fs::read(&path).unwrap(), unpacked(&path));
         let damaged = "damaged or not a results file";
@@ -504,6 +505,6 @@ mod tests {
             assert!(refused(folder.path()).contains(part), "{part}");
         }
         pack(&path, &lines);
-        ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
+        ResultsFile::read(folder.path(), TWO_MILESTONES).unwrap();
     }
 }

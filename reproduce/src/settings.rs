@@ -45,7 +45,7 @@ impl RunSettings {
 
     /// The settings that a run of `experiment` has in this version.
     pub(super) fn expected(experiment: &Experiment, effort: Effort) -> anyhow::Result<Self> {
-        let length = experiment.stages.first().map(|stage| stage.length(effort));
+        let length = experiment.milestones.first().map(|milestone| milestone.length(effort));
         let overrides = RunOverrides {
             seed: Some(1),
             steps: length.and_then(|length| match length {

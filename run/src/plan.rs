@@ -111,8 +111,8 @@ impl Plan {
     }
 }
 
-/// Writes the first files of a new run directory and returns the configuration as the roles read it: a date among the
-/// environment's parameters is a string there, and all processes must compute the same identity.
+/// Writes the first files of a new run directory. Returns the configuration as the roles will read it: writing changes
+/// it (a date among the environment's parameters becomes a string), and all processes must compute the same identity.
 fn fill(run: &RunDir, config: &Config, description: Option<&Description>) -> anyhow::Result<Config> {
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
@@ -122,6 +122,7 @@ fn fill(run: &RunDir, config: &Config, description: Option<&Description>) -> any
     }
     run.write_config(&as_written(config))?;
     let mut read = run.config()?;
+    // `config.toml` does not have these two keys.
     (read.replay.ratio_since, read.replay.updates_before) = (config.replay.ratio_since, config.replay.updates_before);
     run.write_used_config(&read)?;
     Ok(read)

@@ -210,9 +210,10 @@ impl SupervisedRole {
         self.handle_end_at(status, give_up_after, Instant::now())
     }
 
-    /// After a process that was able to work, the role is restarted and its failures are forgotten, unless it fails by
-    /// itself again and again without saving anything. A kill is no failure either if the process was waiting, had made
-    /// a step, or was within its usual start-up time. Every other end is one.
+    /// Restarts the role, unless it is given up. Not failures: the end of a process that was able to work, after which
+    /// earlier failures are forgotten; and a kill while the process waited, after its first step, or within its usual
+    /// start-up time. Failures: every other end, and a repeated end by itself of a process that was able to work but
+    /// has saved nothing in between.
     fn handle_end_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];

@@ -2,6 +2,8 @@
 
 use std::process::Command;
 
+use shoal_run::plan::preset_names;
+
 use crate::support::{Workplace, error_line, output_of};
 
 /// The completions that bash offers for the last of these words.
@@ -35,11 +37,9 @@ fn bash_completes_commands_presets_files_and_keys() {
     std::fs::write(place.path().join("mine.toml"), "").unwrap();
     std::fs::write(place.path().join("mine.txt"), "").unwrap();
     assert_eq!(completions(&place, &["shoal", "expo"]).trim(), "export");
-    let presets = completions(&place, &["shoal", "train", "pend"]);
-    assert_eq!(
-        presets.split_whitespace().collect::<Vec<_>>(),
-        ["pendulum", "pendulum-sac", "pendulum-td3"]
-    );
+    let completed = completions(&place, &["shoal", "train", "pend"]);
+    let presets: Vec<&str> = preset_names().filter(|name| name.starts_with("pend")).collect();
+    assert_eq!(completed.split_whitespace().collect::<Vec<_>>(), presets);
     assert_eq!(completions(&place, &["shoal", "train", "mi"]).trim(), "mine.toml");
     let keys = completions(&place, &["shoal", "train", "pendulum", "--set", "ddpg.t"]);
     assert_eq!(keys.trim(), "ddpg.tau=");

@@ -1,4 +1,6 @@
 //! What the roles report to the launcher while they work: small plain structs, a channel for each kind.
+//!
+//! An *update* is a gradient step or, for algorithms that use each row once, a consumed row.
 
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
@@ -23,7 +25,7 @@ pub struct Heartbeat {
     pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,
-    /// Environment steps since it started; for a learner updates: gradient steps, or consumed rows (`TransitionUse`).
+    /// Environment steps since it started; for a learner updates.
     pub steps: u64,
     /// Version of the policy it uses or publishes.
     pub policy_version: u64,
@@ -65,9 +67,6 @@ impl Heartbeat {
     }
 }
 
-/// The most environments of an actor.
-pub const MAX_ENVS: u32 = 4_096;
-
 /// An exploration episode has ended.
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[repr(C)]
@@ -96,7 +95,7 @@ pub struct EvaluationReport {
     pub policy_version: u64,
     /// Environment steps that the policy was learned from.
     pub env_steps: u64,
-    /// Updates: gradient steps, or consumed rows (`TransitionUse`), that made the policy.
+    /// Updates that made the policy.
     pub updates: u64,
     /// Mean of the episodes' returns.
     pub return_mean: f64,
@@ -124,7 +123,7 @@ pub struct LearnerReport {
     pub env_steps: u64,
     /// Episodes that end within them.
     pub episodes: u64,
-    /// Updates: gradient steps, or consumed rows (`TransitionUse`), so far.
+    /// Updates so far.
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,

@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 /// The longest time limit of an environment, in steps.
 pub const MAX_TIME_LIMIT: u32 = 1_000_000;
 
+/// The most environments of an actor.
+pub const MAX_ENVS: u32 = 4_096;
+
 /// A 32-bit float has every whole number up to this one.
 pub const MAX_EXACT_INTEGER: u32 = 1 << 24;
 

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use rustix::process::{Signal, getpgrp, getpid, kill_process, kill_process_group};
 
-/// How long a role may take to end after its standard input has closed. After that, a thread of its own kills it. The
-/// limits of a living launcher are not longer.
+/// How long a role may take to end after its standard input has closed. After that, a thread of its own kills it. A
+/// living launcher waits no longer than this before it kills the role itself.
 pub const GRACE: Duration = Duration::from_secs(15);
 
 const RETIRE: u8 = 1;

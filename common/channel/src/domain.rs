@@ -21,7 +21,8 @@ use super::memory;
 /// How long to wait for a run's lock. Each process holds it for some milliseconds, or seconds where the disk is busy.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How long a client waits for a run's lock. Without it, it makes no ports and does not drop those it has.
+/// How long a client waits for a run's lock. A client without the lock makes no ports, and leaks those it has instead
+/// of dropping them (docs/DESIGN.md#who-is-alive).
 const CLIENT_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How a process takes part in a run.

@@ -39,7 +39,8 @@ const RETRY_EVERY: u32 = 32;
 /// restarts.
 const MAX_SLEEP: Duration = Duration::from_millis(50);
 
-/// Names the event service of a process by its role and its index in that role.
+/// Names the event service of a process by its role and its index in that role (in shared memory
+/// `bell/<role>/<index>`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EventName(pub Role, pub u32);
 

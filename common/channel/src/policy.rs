@@ -62,7 +62,7 @@ pub struct PolicyHeader {
     pub version: u64,
     /// Environment steps that it was learned from.
     pub env_steps: u64,
-    /// Updates: gradient steps, or consumed rows (`TransitionUse`), that made it.
+    /// Updates that made it.
     pub updates: u64,
     /// Fingerprint of the parameters' layout.
     pub fingerprint: u64,

@@ -8,7 +8,8 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport, MAX_ENVS};
+use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_base::space::MAX_ENVS;
 
 use super::domain::{Domain, participants};
 use super::error::ChannelError;

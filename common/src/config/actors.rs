@@ -1,8 +1,8 @@
 //! `[actors]`.
 
-use shoal_base::report::MAX_ENVS;
 use shoal_base::section;
 use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
+use shoal_base::space::MAX_ENVS;
 
 section! {
     /// The actors, and the size of their chunks.

@@ -8,10 +8,12 @@ use super::checkpoint::CheckpointConfig;
 use super::environment::EnvironmentConfig;
 use super::evaluation::EvaluationConfig;
 use super::learner::LearnerConfig;
+use super::observation::ObservationConfig;
 use super::remote::RemoteConfig;
 use super::replay::ReplayConfig;
+use super::reward::RewardConfig;
 use super::run::RunConfig;
-use crate::algorithms::{AlgorithmConfig, ExplorationConfig, ObservationConfig, RewardConfig};
+use crate::algorithms::{AlgorithmConfig, ExplorationConfig};
 
 /// Every section that the user may write, including all algorithms' sections, but without an environment's own
 /// parameters.

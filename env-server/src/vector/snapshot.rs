@@ -49,8 +49,8 @@ impl VectorEnvironment {
     }
 
     /// Continues the training episodes of a snapshot. The snapshot must come from as many environments, made with the
-    /// same name, parameters, seed, server and stream. All later observations, rewards and flags are then the same as
-    /// in the original. Writes the E observations to act on next.
+    /// same name, parameters, seed, server and incarnation. All later observations, rewards and flags are then the same
+    /// as in the original. Writes the E observations to act on next.
     ///
     /// Panics unless `observations` has E × observation width numbers.
     ///

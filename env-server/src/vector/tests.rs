@@ -11,9 +11,9 @@ pub(super) struct Fixture {
 }
 
 impl Fixture {
-    pub(super) fn of(name: &str, parameters: &str, count: u32, [seed, server, stream]: [u64; 3]) -> Self {
+    pub(super) fn of(name: &str, parameters: &str, count: u32, [seed, server, incarnation]: [u64; 3]) -> Self {
         let parameters = parameters.parse().unwrap();
-        let vector = VectorEnvironment::new(name, &parameters, count, seed, server, stream).unwrap();
+        let vector = VectorEnvironment::new(name, &parameters, count, seed, server, incarnation).unwrap();
         let width = vector.spec().observation.width();
         let nans = |n| vec![f32::NAN; count as usize * n];
         Self {

@@ -44,7 +44,7 @@ pub trait Algorithm {
     /// fingerprint with their own.
     fn layout(&self) -> PolicyLayout;
 
-    /// Updates so far: gradient steps, or consumed rows for `TransitionUse::Transitions` and `Episodes`.
+    /// Updates so far, as [`shoal_common::report`] defines them.
     fn updates(&self) -> u64;
 
     /// Makes one or more updates from rows before `rows`, and adds their number to [`updates`](Self::updates). The
@@ -84,6 +84,27 @@ pub struct Losses {
     pub q_mean: f32,
     /// The temperature α with which these losses were computed; `None` for algorithms without one.
     pub temperature: Option<f32>,
+}
+
+/// Sums of what updates report.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct LossSums {
+    pub(crate) critic_loss: f64,
+    pub(crate) actor_loss: f64,
+    pub(crate) q_mean: f64,
+    /// NaN if the algorithm has none.
+    pub(crate) temperature: f64,
+    pub(crate) updates: u64,
+}
+
+impl LossSums {
+    pub(crate) fn add(&mut self, losses: Losses) {
+        self.critic_loss += f64::from(losses.critic_loss);
+        self.actor_loss += f64::from(losses.actor_loss);
+        self.q_mean += f64::from(losses.q_mean);
+        self.temperature += losses.temperature.map_or(f64::NAN, f64::from);
+        self.updates += 1;
+    }
 }
 
 /// The sizes of a run that algorithms depend on.

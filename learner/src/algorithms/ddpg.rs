@@ -100,7 +100,7 @@ impl Ddpg {
             critic_loss,
             actor_loss,
             q_mean,
-            temperature: None,
+            ..Losses::default()
         }
     }
 

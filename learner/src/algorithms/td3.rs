@@ -112,7 +112,7 @@ impl Td3 {
             critic_loss: loss,
             actor_loss: self.actor_loss,
             q_mean,
-            temperature: None,
+            ..Losses::default()
         }
     }
 

@@ -28,7 +28,7 @@ const PREVIOUS: &str = "previous.ckpt";
 /// A learner's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counters {
-    /// Updates: gradient steps, or consumed rows (`TransitionUse`).
+    /// Updates so far.
     pub updates: u64,
     /// Environment steps of all actors that count for the ratio of updates: rows of the replay.
     pub rows: u64,

@@ -45,7 +45,7 @@ pub enum LearnerError {
              reward.scale"
     )]
     Diverged {
-        /// Updates: gradient steps, or consumed rows (`TransitionUse`).
+        /// Updates so far.
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.

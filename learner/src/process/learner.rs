@@ -21,7 +21,7 @@ use super::error::LearnerError;
 use super::intake::Intake;
 use super::settings::LearnerSettings;
 use super::sizes::replay_layout;
-use crate::algorithms::algorithm::{Algorithm, Losses, SavedState};
+use crate::algorithms::algorithm::{Algorithm, LossSums, SavedState};
 use crate::algorithms::registry;
 use crate::networks::threads::Threads;
 use crate::replay::{Replay, ReplayError, ReplayLayout, SyncedRows};
@@ -39,27 +39,6 @@ const QUIET_TIME: Duration = Duration::from_millis(200);
 
 /// At the end, the learner takes chunks for no longer than this.
 const LAST_CHUNKS_TIMEOUT: Duration = Duration::from_secs(2);
-
-/// Sums over the updates since the last report.
-#[derive(Clone, Copy, Debug, Default)]
-struct LossSums {
-    critic_loss: f64,
-    actor_loss: f64,
-    q_mean: f64,
-    /// NaN if the algorithm has none.
-    temperature: f64,
-    updates: u64,
-}
-
-impl LossSums {
-    fn add(&mut self, losses: Losses) {
-        self.critic_loss += f64::from(losses.critic_loss);
-        self.actor_loss += f64::from(losses.actor_loss);
-        self.q_mean += f64::from(losses.q_mean);
-        self.temperature += losses.temperature.map_or(f64::NAN, f64::from);
-        self.updates += 1;
-    }
-}
 
 /// Whether another chunk might overwrite a row that an update still needs: an algorithm that uses each row once needs
 /// all rows that it has not used. After a power loss there may be no row.
@@ -94,6 +73,7 @@ pub(crate) struct Learner<'a> {
     checkpoints: Checkpoints,
     sync: Option<JoinHandle<io::Result<SyncedRows>>>,
     reporter: Reporter<LearnerReport>,
+    /// Of the updates since the last report.
     losses: LossSums,
     reported_at: Instant,
     heartbeats: Reports<Heartbeat>,
@@ -143,7 +123,7 @@ impl<'a> Learner<'a> {
         Ok(learner)
     }
 
-    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
+    /// Updates so far.
     pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }

@@ -15,10 +15,10 @@ use super::pictures::{self, Pictures};
 use super::signals::{Trace, traces};
 
 /// At most about this many frames of an episode. A longer episode shows every second step, every third, and so on.
-const FRAMES: usize = 1_000;
+const MAX_FRAMES: usize = 1_000;
 
 /// Approximate limit on the steps of all episodes of a run.
-const STEPS: usize = 20_000;
+const MAX_STEPS: usize = 20_000;
 
 /// Playable episodes, or the reason why there are none.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -94,10 +94,10 @@ impl Played {
         }
         let limit = config.spec.time_limit.max(1) as usize;
         let mut played = Vec::new();
-        for number in 0..limits.episodes.min(STEPS / limit).max(1) {
-            let which = (config.run.seed, number as u64);
+        for number in 0..limits.episodes.min(MAX_STEPS / limit).max(1) {
+            let episode = (config.run.seed, number as u64);
             let (trajectory, frames) = if is_external && number < limits.pictured && no_pictures.is_none() {
-                let (trajectory, frames) = rollout.filmed_episode(which, limits.pictures, |_| ())?;
+                let (trajectory, frames) = rollout.filmed_episode(episode, limits.pictures, |_| ())?;
                 pace = pace.or(frames.as_ref().ok().and_then(|frames| frames.fps).map(f64::recip));
                 let frames = frames.and_then(|frames| Pictures::of(&frames, limits.bytes));
                 no_pictures = frames
@@ -106,7 +106,7 @@ impl Played {
                     .map(|reason| format!("This environment cannot be shown: {reason}."));
                 (trajectory, frames.ok())
             } else {
-                (rollout.evaluation_episode(which.0, which.1)?, None)
+                (rollout.evaluation_episode(episode.0, episode.1)?, None)
             };
             let of_frames = |frames: &[usize]| traces(&signals, &config.spec, &trajectory, frames);
             played.push(Episode::of(number, &trajectory, of_frames, frames));
@@ -142,7 +142,7 @@ impl Episode {
         pictures: Option<Pictures>,
     ) -> Self {
         let steps = trajectory.actions.len();
-        let stride = steps.div_ceil(FRAMES).max(1);
+        let stride = steps.div_ceil(MAX_FRAMES).max(1);
         let frames: Vec<usize> = (0..steps).step_by(stride).chain([steps]).collect();
         Self {
             number,

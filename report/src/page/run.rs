@@ -19,7 +19,7 @@ use super::played::Played;
 use super::settings::{self, Setting};
 
 /// At most this many incidents of a run are listed.
-const INCIDENTS: usize = 400;
+const MAX_INCIDENTS: usize = 400;
 
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Run {
@@ -315,8 +315,8 @@ impl Incidents {
         use shoal_run::records::recorder::IncidentKind;
         let count = |what| rows.iter().filter(|row| row.what == what).count();
         let (restarts, kills) = (count(IncidentKind::Restarted), count(IncidentKind::Killed));
-        let more = rows.len().saturating_sub(INCIDENTS);
-        rows.truncate(INCIDENTS);
+        let more = rows.len().saturating_sub(MAX_INCIDENTS);
+        rows.truncate(MAX_INCIDENTS);
         Self {
             rows,
             more,

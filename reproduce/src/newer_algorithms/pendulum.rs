@@ -5,11 +5,11 @@ use shoal_run::evaluation::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, spread};
-use super::super::experiment::{Experiment, Stage};
+use super::super::experiment::{Experiment, Milestone};
 use super::super::family::{Family, Results, TrainedRun};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::{experiment, learning_curves, stage};
+use super::{experiment, learning_curves, milestone};
 
 /// The final evaluation is over a thousand starts.
 const STARTS: &[&str] = &["evaluation.final_episodes=1000"];
@@ -26,7 +26,7 @@ const EXPERIMENTS: [Experiment; 2] = [
                 "evaluation.final_episodes=10",
             ],
         ),
-        &[stage(20_000)],
+        &[milestone(20_000)],
     ),
     experiment(
         "pendulum-td3",
@@ -39,7 +39,7 @@ const EXPERIMENTS: [Experiment; 2] = [
                 "evaluation.final_episodes=10",
             ],
         ),
-        &[stage(20_000)],
+        &[milestone(20_000)],
     ),
 ];
 
@@ -59,7 +59,7 @@ impl Family for PendulumAlgorithms {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, _: &Milestone) -> anyhow::Result<Measurements> {
         let best = SwingUp::run(&mut Rollout::new(&trained.config, &trained.best.parameters)?)?;
         Ok(Measurements { best: best.measures() })
     }

@@ -7,11 +7,11 @@ use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, Measures, NEAR_STA
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, spread};
-use super::super::experiment::{Experiment, Stage};
+use super::super::experiment::{Experiment, Milestone};
 use super::super::family::{Family, Results, TrainedRun};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::{experiment, learning_curves, stage};
+use super::{experiment, learning_curves, milestone};
 
 type Seed = SeedResult<Measurements>;
 
@@ -29,10 +29,10 @@ const QUICK_TD3: &[&str] = &[
 ];
 
 const EXPERIMENTS: [Experiment; 4] = [
-    experiment("point-mass-r3-sac", 10, (&[], QUICK_SAC), &[stage(100_000)]),
-    experiment("point-mass-r1-sac", 5, (&[], QUICK_SAC), &[stage(100_000)]),
-    experiment("point-mass-r2-sac", 5, (&[], QUICK_SAC), &[stage(100_000)]),
-    experiment("point-mass-r3-td3", 3, (&[], QUICK_TD3), &[stage(100_000)]),
+    experiment("point-mass-r3-sac", 10, (&[], QUICK_SAC), &[milestone(100_000)]),
+    experiment("point-mass-r1-sac", 5, (&[], QUICK_SAC), &[milestone(100_000)]),
+    experiment("point-mass-r2-sac", 5, (&[], QUICK_SAC), &[milestone(100_000)]),
+    experiment("point-mass-r3-td3", 3, (&[], QUICK_TD3), &[milestone(100_000)]),
 ];
 
 /// The number of steps "at rest": the last steps of a test run.
@@ -79,7 +79,7 @@ impl Family for PointMassAlgorithms {
     type Measurements = Measurements;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
-    fn measure(trained: &TrainedRun, _: &Stage) -> anyhow::Result<Measurements> {
+    fn measure(trained: &TrainedRun, _: &Milestone) -> anyhow::Result<Measurements> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let test_runs = TestRun::from_starts(&mut Rollout::new(&trained.config, &trained.best.parameters)?, &starts)?;
         Ok(Measurements {
@@ -191,7 +191,7 @@ mod tests {
             panic!("one section")
         };
         assert_eq!(section.claims[0].held(), [true, false, true]);
-        assert!(!section.claims[4].held()[2], "{}", section.claims[4].ours);
+        assert!(!section.claims[4].held()[2], "{}", section.claims[4].measured);
         assert!(section.claims[1].held().is_empty());
         assert!(section.remark.contains("| 3 | 100.0 | 12 |"), "{}", section.remark);
         assert_eq!(section.figures.len(), 1);

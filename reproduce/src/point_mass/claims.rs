@@ -72,10 +72,10 @@ fn final_distances_text(seeds: &[Seed]) -> String {
     )
 }
 
-fn arrival_claim(seeds: &[Seed], thesis: &'static str) -> Claim {
+fn arrival_claim(seeds: &[Seed], statement: &'static str) -> Claim {
     let farthest = |seed: &Seed| greatest(near(&seed.measurements.best), DISTANCE);
     Claim::each_seed(
-        thesis,
+        statement,
         "from each of the four starts of section 5.3 it ends within 0.05 m of the goal",
         format!(
             "largest of the four distances at the end: {} m; {}",
@@ -211,8 +211,8 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
 pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
     let turning = |seed: &Seed| mean(&seed.measurements.best, TURNING);
     let turnings = |seeds: &[Seed]| spread(seeds.iter().map(turning), 1);
-    let calmer = |thesis, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| {
-        let ours = format!(
+    let calmer = |statement, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| {
+        let measured = format!(
             "turning from all twelve starts: {} rad with {}, {} rad with {}",
             turnings(seeds),
             names[0],
@@ -220,7 +220,7 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
             names[1]
         );
         let held = pairs(than, seeds).map(|(than, it)| turning(it) < turning(than));
-        Claim::each_seed(thesis, criterion, ours, held)
+        Claim::each_seed(statement, criterion, measured, held)
     };
     vec![
         calmer(
@@ -256,8 +256,8 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
             mean(near(&after.measurements.last), measure),
         )
     };
-    let check = |thesis, criterion, what: &str, measure: Measure, decimals, holds: fn(f64, f64) -> bool| {
-        let ours = format!(
+    let check = |statement, criterion, what: &str, measure: Measure, decimals, holds: fn(f64, f64) -> bool| {
+        let measured = format!(
             "{what}: best policy of the first training {}; last policy of the additional training {}",
             spread(pairs(before, after).map(|(b, a)| value(b, a, measure).0), decimals),
             spread(pairs(before, after).map(|(b, a)| value(b, a, measure).1), decimals)
@@ -265,7 +265,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
         let held = pairs(before, after)
             .map(|(b, a)| value(b, a, measure))
             .map(|(b, a)| holds(b, a));
-        Claim::each_seed(thesis, criterion, ours, held)
+        Claim::each_seed(statement, criterion, measured, held)
     };
     vec![
         check(

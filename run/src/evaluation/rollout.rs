@@ -132,11 +132,10 @@ impl<'a> Rollout<'a> {
             .map(|(trajectory, _)| trajectory)
     }
 
-    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `max_frames` pictures. If there are
-    /// none, returns the reason: a sentence without its full stop. If another program serves the environment, the
-    /// rollout must have been made with [`with_pictures`](Self::with_pictures). Drawing takes much longer than
-    /// stepping, so a long episode is played twice: first to find its length, then to draw evenly spaced states. Calls
-    /// `progress` with the number of steps.
+    /// As [`evaluation_episode`](Self::evaluation_episode), with pictures, about `max_frames` at most, or the reason
+    /// why there are none: a sentence without its full stop. A long episode is played twice, because drawing takes much
+    /// longer than stepping: first for its length, then to draw evenly spaced states. Where another program serves the
+    /// environment, call [`with_pictures`](Self::with_pictures) first. Calls `progress` with the number of steps.
     pub fn filmed_episode(
         &mut self,
         (seed, number): (u64, u64),

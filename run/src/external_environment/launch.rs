@@ -45,7 +45,7 @@ pub struct LaunchSpec<'a> {
     pub environments: u32,
     /// The root of its random streams.
     pub seed: u64,
-    /// With seed and index, selects the random streams of its training episodes.
+    /// With seed and index, selects the random streams of its training episodes: the incarnation, or 0 in lockstep.
     pub stream: u64,
     /// Where it is started, and with what.
     pub launch_context: LaunchContext,

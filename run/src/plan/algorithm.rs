@@ -6,8 +6,8 @@ use toml::{Table, Value};
 
 use crate::usage::UsageError;
 
-/// Settings for single Gymnasium environments, `[ID.ALGORITHM]`, which replace the algorithm's defaults; and in `[ID]`,
-/// where there is one, the algorithm that suits the environment best.
+/// Settings for single Gymnasium environments. `[ID.ALGORITHM]` has those that replace the algorithm's defaults; the
+/// key `method` of `[ID]` names the algorithm that suits the environment best, if its spaces do not tell.
 const OF_ENVIRONMENTS: &str = include_str!("../../../presets/method/environments.toml");
 
 /// The key of an environment's best algorithm there.

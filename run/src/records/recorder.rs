@@ -56,7 +56,7 @@ pub struct EvaluationRecord {
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
     pub env_steps: u64,
-    /// Updates that made the policy: gradient steps, or consumed rows for algorithms that use each row once.
+    /// Updates that made the policy.
     pub updates: u64,
     /// Version of the policy.
     pub policy_version: u64,
@@ -81,7 +81,7 @@ pub struct LearnerRecord {
     /// Episodes ended; 0 in the records of earlier versions.
     #[serde(default)]
     pub episodes: u64,
-    /// Updates done: gradient steps, or consumed rows for algorithms that use each row once.
+    /// Updates so far.
     pub updates: u64,
     policy_version: u64,
     /// Mean loss of the value estimate since the previous row.
@@ -205,7 +205,7 @@ impl Recorder {
     /// Records the settings for TensorBoard.
     pub fn settings(&mut self, config: &Config) -> Result<(), RecordError> {
         let mut settings = config.values();
-        // The run's name and its environment's spaces are nobody's choice.
+        // The program chooses the run's id, and the environment its spaces.
         settings.retain(|key, _| key != "run.id" && !key.starts_with("spec."));
         let written = self.events.hyperparameters(&settings);
         written.map_err(|cause| RecordError::Write {

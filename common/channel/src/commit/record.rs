@@ -15,7 +15,8 @@ use super::words::{Words, WritableWords};
 pub struct ChunkId {
     /// Grows with every process that the run starts.
     pub incarnation: u64,
-    /// The chunk's number, over all of the actor's incarnations.
+    /// The chunk's number, over all of the actor's incarnations. A handshake has no number of its own: in its header it
+    /// is 0, and in a record it is that of the chunk before it (`ReceivedChunk::id` converts).
     pub sequence: u64,
 }
 

@@ -210,7 +210,7 @@ pub struct RunStatus {
     pub episodes: u64,
     /// Episodes after which training ends, if that is earlier.
     pub episodes_limit: Option<u64>,
-    /// Gradient steps made so far; rows where each is used once.
+    /// Updates so far.
     pub updates: u64,
     /// Environment steps committed to the replay over the whole run.
     pub replay_rows: u64,

@@ -5,10 +5,9 @@ use toml::{Table, Value};
 
 use super::sorted;
 use crate::algorithms::{
-    AlgorithmConfig, DdpgConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, ReturnWeighting, RewardConfig,
-    TabularConfig, Warmup,
+    AlgorithmConfig, DdpgConfig, ExplorationConfig, ReinforceConfig, ReturnWeighting, TabularConfig, Warmup,
 };
-use crate::config::{Config, Mode};
+use crate::config::{Config, Mode, ObservationConfig, RewardConfig};
 use shoal_policy::network::Activation;
 
 /// The text; `None` for an algorithm, a network or rows that did not exist then.
