@@ -329,7 +329,7 @@ def spoilt_server():
 
     def spoilt(self, actions, blocks):
         step(self, actions, blocks)
-        if self._purpose is environments.Purpose.TRAINING and self._episode[0] == 0:
+        if self._purpose is environments.Purpose.TRAINING and self._slots[0].episode == 0:
             blocks.rewards[:] = np.nan
 
     environments.Environments.step = spoilt

@@ -28,9 +28,18 @@ const PARTICIPANT: usize = 96;
 /// of bytes. (The length of a file may be limited, so it is not used.)
 const RESERVATION: &str = "reserved_";
 
+/// The same word of earlier versions, whose runs may be alive.
+const EARLIER_RESERVATION: &str = "promise_";
+
+/// The prefix of the run and the number of bytes in the name of a file that records a reservation.
+fn split_reservation(name: &str) -> Option<(&str, &str)> {
+    name.split_once(RESERVATION)
+        .or_else(|| name.split_once(EARLIER_RESERVATION))
+}
+
 /// Whether a file of this name records a reservation.
 pub(super) fn is_reservation(name: &str) -> bool {
-    name.contains(RESERVATION)
+    split_reservation(name).is_some()
 }
 
 /// Bytes of a port's data: `chunks` chunks with headers `H` and `U` and `payload` bytes of payload.
@@ -93,7 +102,7 @@ fn reserved_by_others(run_id: &str) -> io::Result<u64> {
         .filter(|(_, metadata)| metadata.uid() == user)
         .collect();
     let outstanding = |(name, _): &(String, Metadata)| {
-        let (run, reserved) = name.split_once(RESERVATION)?;
+        let (run, reserved) = split_reservation(name)?;
         let reserved: u64 = reserved.parse().ok()?;
         let others = run.starts_with("shoal_") && run != prefix(run_id);
         let taken = files.iter().filter(|(name, _)| name.starts_with(run));

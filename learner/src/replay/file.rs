@@ -18,6 +18,11 @@ use super::error::ReplayError;
 /// Creates an empty replay under a temporary name and renames it, so that a file with the replay's name is whole.
 pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOffsets), ReplayError> {
     let offsets = offsets(path, layout)?;
+    let check = || match fs::exists(path).map_err(io(path, "look for"))? {
+        true => Err(ReplayError::Exists(path.into())),
+        false => Ok(()),
+    };
+    check()?;
     let temporary = temporary(path);
     let mut options = OpenOptions::new();
     // Truncated only under the lock, because another process may be creating it.
@@ -30,11 +35,9 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOf
         .open(&temporary);
     let file = file.map_err(io(path, "create"))?;
     lock(path, &file)?;
+    // Again, because another process may have published this very file while this one waited for the lock.
+    check()?;
     let temporary = Temporary(temporary);
-    // After the lock: another process may have published this very file while this one waited.
-    if fs::exists(path).map_err(io(path, "look for"))? {
-        return Err(ReplayError::Exists(path.into()));
-    }
     file.set_len(0)
         .and_then(|()| file.set_permissions(Permissions::from_mode(0o600)))
         .map_err(io(path, "create"))?;
