@@ -11,6 +11,9 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use shoal_run::numbers::parse_positive_count;
 
+#[cfg(feature = "remote")]
+use self::host::join;
+
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
     /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
@@ -92,9 +95,6 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
 fn join(_args: &JoinArgs, _place: &str, _actors: u32) -> anyhow::Result<ExitCode> {
     anyhow::bail!(shoal_remote::NOT_BUILT)
 }
-
-#[cfg(feature = "remote")]
-use self::host::join;
 
 #[cfg(test)]
 mod tests {
